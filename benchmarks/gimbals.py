@@ -343,14 +343,7 @@ def _nees(apart: Float, covariance: Float) -> float:
 
 
 def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float, float]:
-    """Compute the changing and the constant part of the attitude errors: RMS per axis over the cameras.
-
-    The third value is the RMS over the cameras of the mean error about the optical axis.
-
-    Attitudes are those that the method used: its own, or the logged ones. A log's constant error turns the
-    camera. Attitudes relative to the background have one that turns the world, which would change along the
-    camera's axes as it pans. The constant part is the one that leaves less.
-    """
+    """Compute the changing and the constant part of the attitude errors: RMS per axis over the cameras."""
     changing, constant, roll = [], [], []
     own = session / "reconstruct" / "cameras.parquet"
     estimated = pd.read_parquet(own) if own.exists() else pd.DataFrame({"camera": []})

@@ -70,8 +70,7 @@ class FilmSettings:
 def film_settings(stated: str) -> tuple[FilmSettings, Path | None]:
     """Read `HZ[,KEY=VALUE...]`, where a value may hold commas; return the scenario beside the settings.
 
-    Raises:
-        ValueError: an unknown key, or a number that is none or out of range.
+    ValueError: an unknown key, or a number that is none or out of range.
     """
     rate_hz, *parts = stated.split(",")
     values = {"rate_hz": rate_hz}
@@ -122,11 +121,9 @@ def film(
         folder: the session; `replan` has run.
         scenario: of the simulated flight; by default it is searched beside its pictures and the session.
 
-    Raises:
-        DataError: nothing was compared yet, a table of the session was changed, the flight was not simulated,
-            its scenario is missing or another flight's, the span holds fewer than two pictures, or the
-            detector's files are missing.
-        BusyError: another process writes the session.
+    DataError: nothing was compared yet, a table of the session was changed, the flight was not simulated, its
+    scenario is missing or another flight's, the span holds fewer than two pictures, or the detector's files
+    are missing. BusyError: another process writes the session.
     """
     settings = settings or FilmSettings()
     progress = progress or Silent()
@@ -353,14 +350,7 @@ def _film_camera(
 def _whose(
     arm: _Arm, pose: tuple[Float, Float], moment: int, xy: Float, confidence: Float
 ) -> tuple[Float, Float]:
-    """Choose the detection of each person: xy [P, J, 2] px, confidence [P, J].
-
-    Of one person it is the first. Of several it is the nearest to the true joints, if the median distance is
-    below `MAX_MEDIAN_OFF_M` at that person's distance.
-
-    Args:
-        xy: [K, J, 2] px of K detections; confidence [K, J].
-    """
+    """Choose the detection of each person: xy [P, J, 2] px, confidence [P, J]."""
     found = np.full((len(arm.people), *xy.shape[1:]), np.nan)
     sure = np.zeros(found.shape[:2])
     if len(arm.people) == 1:

@@ -91,8 +91,7 @@ class Replanned:
 def settings_of(stated: Sequence[str], **others: Any) -> ReplanSettings:
     """Make settings of YAML files (docs/planner.md) and of texts KEY=VALUE; of a key the last one counts.
 
-    Raises:
-        DataError: a file cannot be read, or a setting is unknown or out of range.
+    DataError: a file cannot be read, or a setting is unknown or out of range.
     """
     values: dict[str, object] = {}
     source: Path | str = "--config"
@@ -117,11 +116,8 @@ def replan(
     """Replay the planners on a session, and compare them; run again even if nothing changed with `force`.
 
     `name` is that of the folder in which the comparison stays: by default the first digits of the key.
-
-    Raises:
-        DataError: the session cannot be used (it has no positions of the actor, or a table was changed), or a
-            setting is wrong.
-        BusyError: another process writes the session.
+    DataError: the session cannot be used (it has no positions of the actor, or a table was changed), or a
+    setting is wrong. BusyError: another process writes the session.
     """
     settings = settings or ReplanSettings()
     progress = progress or Silent()
@@ -181,8 +177,7 @@ def replan(
 def refuse_name(name: str | None) -> None:
     """Refuse a name that cannot be a folder of its own among the tables and those of the arms.
 
-    Raises:
-        DataError: it cannot.
+    DataError: it cannot.
     """
     if name is None:
         return
@@ -200,11 +195,7 @@ def refuse_name(name: str | None) -> None:
 def _keep_by_name(
     session: WritableSession, folder: Path, name: str, made_of: Mapping[str, object]
 ) -> tuple[list[str], list[str]]:
-    """Copy the comparison in `folder` into a folder of its name, and earlier ones from the stage before.
-
-    Returns:
-        Names of all that are kept, and of those that are not, because a file is not as it was written.
-    """
+    """Copy the comparison in `folder` into a folder of its name, and earlier ones from the stage before."""
     own = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     for path in own:
         target = folder / name / path.relative_to(folder)

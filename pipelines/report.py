@@ -105,10 +105,8 @@ def report(
         force: write it again even if nothing changed.
         overwrite: replace a file that lies at `output` and is no page of mocap.
 
-    Raises:
-        DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
-            study; the page cannot be written.
-        BusyError: another process writes the session.
+    DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
+    study; the page cannot be written. BusyError: another process writes the session.
     """
     studied = [read_study(study) for study in studies]
     return_freed_arrays()
@@ -167,9 +165,8 @@ def compare_sessions(
 ) -> Reported:
     """Write the page that compares every session with the first, by default comparison/index.html beside it.
 
-    Raises:
-        DataError: not a session, damaged, changed by hand, stated twice, or the file exists and is no page of
-            mocap (see `overwrite`).
+    DataError: not a session, damaged, changed by hand, stated twice, or the file exists and is no page of
+    mocap (see `overwrite`).
     """
     resolved = [folder.resolve() for folder in folders]
     for folder, place in zip(folders, resolved, strict=True):
@@ -206,12 +203,9 @@ def write_figures_of(
 
     The files are PNG, SVG and PDF 180 mm wide, the numbers of each figure as CSV, and figures.json with
     titles and captions. Figures that an earlier run wrote there are replaced; with `overwrite` also other
-    things, but never a session.
-
-    Raises:
-        DataError: not a session, or damaged; a table of it, or pictures, were changed; the folder holds
-            something else, or cannot be written.
-        BusyError: another process writes the same folder.
+    things, but never a session. DataError: not a session, or damaged; a table of it, or pictures, were
+    changed; the folder holds something else, or cannot be written. BusyError: another process writes the same
+    folder.
     """
     try:
         refuse_foreign(target, overwrite=overwrite)
@@ -255,8 +249,7 @@ def write_figures_of(
 def read_study(folder: Path) -> StudyContent:
     """Read the result of `mocap study` in a folder.
 
-    Raises:
-        DataError: it holds no study, or a damaged one.
+    DataError: it holds no study, or a damaged one.
     """
     remedy = "name a folder that `mocap study ... -o FOLDER` wrote"
     if not (folder / STUDY_MARK).is_file():
@@ -338,8 +331,7 @@ def _read_frame(pictures: dict[str, CameraPictures], camera: str, frame: int) ->
 def content_of(folder: Path) -> SessionContent:
     """Load all that the page of a session shows.
 
-    Raises:
-        DataError: not a session, or damaged; a table of it was changed.
+    DataError: not a session, or damaged; a table of it was changed.
     """
     records = _finished_stages(open_session(folder))
     return _load(folder, read_description(folder), records)

@@ -82,9 +82,8 @@ def simulate(
         workers: the number of blocks in parallel; logs, truth and pictures do not depend on it.
         overwrite: replace a folder that is no simulation, or that holds other files as well.
 
-    Raises:
-        DataError: the scenario cannot be used, or the folder cannot be written.
-        BusyError: another process makes the same folder.
+    DataError: the scenario cannot be used, or the folder cannot be written. BusyError: another process makes
+    the same folder.
     """
     progress = progress or Silent()
     scenario = read_scenario(scenario_path)

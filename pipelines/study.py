@@ -99,10 +99,8 @@ class Studied:
 def values_of(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Parse `VARIABLE=VALUES` words: values between commas, or START:STOP:STEP with both ends.
 
-    Noise models, which hold commas, are separated by semicolons.
-
-    Raises:
-        DataError: a word has another form, a variable is stated twice, or a range is empty.
+    Noise models, which hold commas, are separated by semicolons. DataError: a word has another form, a
+    variable is stated twice, or a range is empty.
     """
     stated: dict[str, tuple[str, ...]] = {}
     for word in words:
@@ -144,10 +142,9 @@ def study(
         workers: the number of conditions of a walk in parallel; the results do not depend on it.
         overwrite: replace a folder that is no study.
 
-    Raises:
-        DataError: a variable or value is wrong, the folder cannot be written or is a session's, the session
-            or the scenario cannot be used, or nothing was reconstructed.
-        BusyError: another process makes the same folder, or writes the session.
+    DataError: a variable or value is wrong, the folder cannot be written or is a session's, the session or
+    the scenario cannot be used, or nothing was reconstructed. BusyError: another process makes the same
+    folder, or writes the session.
     """
     progress = progress or Silent()
     stated = values_of(words)
@@ -309,11 +306,7 @@ def _measure_condition(
 def _reconstructed(
     method: StudyMethod, views: Views, filmed: Walk, models: Sequence[NoiseModel]
 ) -> tuple[Float, str | None]:
-    """Triangulate views by a method: points [N, 3] m, NaN where there is none, and the reason for a fallback.
-
-    All methods know the standard deviations of the poses. `robust` and `auto` also estimate the noise of
-    keypoints. `auto` also knows the noise models, and so the correlation of pose errors in time.
-    """
+    """Triangulate views by a method: points [N, 3] m (NaN without any), and the reason for a fallback."""
     if method == "auto":
         elapsed_s = (filmed.t_ns - filmed.t_ns[0]) / 1e9
         return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)[1:]
@@ -323,13 +316,7 @@ def _reconstructed(
 
 
 def _compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMethod, Row]:
-    """Compute the errors of several methods on one walk, from points [T * J, 3] m of each, joints fastest.
-
-    Returns:
-        By method the result of `measure` on the joint-frames that all methods have (per joint only the three
-        MPJPEs). These figures are for all joint-frames of the method itself: `reconstructed_share`,
-        `own_mpjpe_mm`, and `pck150` and `pck150_auc`, which count missing joints as wrong.
-    """
+    """Compute the errors of several methods on one walk, from points [T * J, 3] m of each, joints fastest."""
     truth = filmed.joints[:, None]
     found = {method: own.reshape(truth.shape) for method, own in points.items()}
     shared = common(*found.values())
@@ -420,11 +407,7 @@ def _varied(stated: Stated) -> list[str]:
 
 
 def _replay_settings(stated: Stated) -> ReplanSettings:
-    """Return the settings that all replays share.
-
-    Raises:
-        DataError: a variable or a value is wrong.
-    """
+    """Return the settings that all replays share."""
     names = set(SETTINGS) - {"radius_m"}
     unknown = [name for name in stated if name not in {*_OF_SESSION, *names}]
     if unknown:
@@ -472,11 +455,7 @@ def _cells(varied: Stated) -> Iterator[dict[str, Any]]:
 
 
 def _planner_of(planner: PlannerConfig, cell: Mapping[str, Any]) -> PlannerConfig:
-    """Change the planner settings that a cell states.
-
-    Raises:
-        DataError: a value is of another type, or out of range.
-    """
+    """Change the planner settings that a cell states."""
     changes = {
         _SETTINGS.get(name, name): value for name, value in cell.items() if name not in ("arm", "robots")
     }
@@ -530,11 +509,7 @@ def _figures(
 
 
 def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any]) -> dict[str, Any]:
-    """Mark the best combination and the trade-off; return the best and those that are alike.
-
-    Combinations that violate a limit are left out, unless all do. The trade-off is between the error, the way
-    of all drones and the range asked for: nothing on it is beaten or equalled in all three by another.
-    """
+    """Mark the best combination and the trade-off; return the best and those that are alike."""
     kept = [k for k, row in enumerate(rows) if not row["violations"]] or list(range(len(rows)))
     best = min(kept, key=lambda k: float(rows[k]["capped_mm"]))
     rows[best]["best"] = True

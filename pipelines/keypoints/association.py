@@ -153,12 +153,7 @@ def associate(
 
 
 def _noise_of_logs_m(seen: Bodies, logs: Float, most_m: float) -> float:
-    """Estimate the standard deviation on each axis (m) of the logs [T, A, 3] of several people.
-
-    Bodies that three cameras or more place are right. Their median distance to the nearest log gives one
-    value for all logs, between 0.2 m and `most_m`. In a crowd a small value separates neighbours. Without
-    such a body it is `most_m`.
-    """
+    """Estimate the standard deviation on each axis (m) of the logs [T, A, 3] of several people."""
     sure = np.isfinite(seen.spread) & (seen.views > 2)
     apart = np.linalg.norm(seen.middle[sure][:, None] - logs[np.nonzero(sure)[0]], axis=-1)
     apart = apart[np.isfinite(apart).any(axis=1)]
@@ -170,12 +165,7 @@ def _noise_of_logs_m(seen: Bodies, logs: Float, most_m: float) -> float:
 def _near_logs(
     tracks: list[_BodyTrack], logged: list[Float], usual_m: float, most_m: float
 ) -> tuple[list[tuple[Float, float]], tuple[int, ...], list[str]]:
-    """Give each log [T, 3] its standard deviation: `usual_m`, or `most_m` where no track is near by that.
-
-    Returns:
-        The logs that are used, with their standard deviations: all, or none if there are tracks and none of
-        them is near any log. The numbers of those of several logs that no track is near. Messages.
-    """
+    """Give each log [T, 3] its standard deviation: `usual_m`, or `most_m` where no track is near by that."""
     logs = [(log, usual_m if _is_near(tracks, log, usual_m) else most_m) for log in logged]
     unseen = tuple(k for k, (log, sigma_m) in enumerate(logs) if not _is_near(tracks, log, sigma_m))
     if tracks and len(unseen) == len(logs):
@@ -267,17 +257,7 @@ class _PersonTracks:
 def _chains(
     tracks: list[_BodyTrack], time_s: Float, logs: list[tuple[Float, float]], people: int | None
 ) -> tuple[list[_PersonTracks], list[_BodyTrack]]:
-    """Chain tracks into people: those with logs together, each of the others after the one before.
-
-    Args:
-        tracks: all of them.
-        time_s: [T] of their rows.
-        logs: the hips [T, 3] m of each logged person, with their standard deviation on each axis, m.
-        people: their number; None for those with logs, or one.
-
-    Returns:
-        The people (at least one), and the tracks that are nobody's.
-    """
+    """Chain tracks into people: those with logs together, each of the others after the one before."""
     tracks = sorted(tracks, key=lambda one: (-one.views.sum(), -one.confidence, one.identity))
     chains = [_PersonTracks(time_s, log, sigma_m) for log, sigma_m in logs]
     tracks = _by_logs(tracks, chains)
@@ -302,11 +282,7 @@ def _add_people(
     views: SightLines,
     scene: Surroundings | None,
 ) -> Counter[str]:
-    """Add everybody else who is a person; return how many bodies are left out, by `why_no_person`.
-
-    Bodies come in the order of how much they are seen. After one that is seen too shortly there are only
-    pieces of bodies, which are not counted.
-    """
+    """Add everybody else who is a person; return how many bodies are left out, by `why_no_person`."""
     refused: Counter[str] = Counter()
     people = [chain.body(track) for chain in chains if chain.taken]
     while tracks and len(chains) < _MAX_PEOPLE:
@@ -644,11 +620,7 @@ def why_no_body(body: PossiblePerson, views: SightLines, scene: Surroundings | N
 def _is_bystander(
     body: PossiblePerson, people: list[PossiblePerson], views: SightLines, fields: Float
 ) -> bool:
-    """Test if a body stands beyond the cameras that film the people, and never in all of their pictures.
-
-    Cameras about a person look inwards. Whoever is further from everybody taken for a person than half of the
-    cameras are is behind one of them. Two cameras on one side do not look inwards, and see them both.
-    """
+    """Test if a body stands beyond the cameras that film the people, and never in all of their pictures."""
     rows = np.flatnonzero(np.isfinite(body.middle[:, 0]))
     off = np.array([np.hypot(*(body.middle[rows] - one.middle[rows]).T[:2]) for one in people])
     if not np.isfinite(off).any():
@@ -669,12 +641,7 @@ def _is_bystander(
 
 
 def _body_of(choice: Int64, rows: NDArray[np.intp], views: SightLines) -> tuple[float, float]:
-    """Triangulate a body at some times [N] by least squares on its viewing rays.
-
-    Returns:
-        The median over the times of the diagonal of the box about its joints (m), and the median of the
-        whitened squares per degree of freedom (2 per view, less 3) of its joints; NaN without any.
-    """
+    """Triangulate a body at some times [N] by least squares on its viewing rays."""
     time, camera = rows[:, None], np.arange(choice.shape[1])
     taken = np.maximum(choice[rows], 0)
     xy = views.xy[time, camera, taken]

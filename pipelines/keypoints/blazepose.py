@@ -220,8 +220,7 @@ class BlazePoseDetector:
     def load(self, *, threads: int) -> BlazePose:
         """Load the networks; the results do not depend on `threads`.
 
-        Raises:
-            DataError: a file is missing or is not the one that was expected.
+        DataError: a file is missing or is not the one that was expected.
         """
         *_, landmark_model = self.landmark_models.verified().values()
         (person_model,) = self.person_models.verified().values()
@@ -297,10 +296,7 @@ def _quiet_stderr() -> Iterator[None]:
 
 
 def _anchors() -> Float:
-    """Compute the anchor centres [2254, 2] of the person detector, as shares of its input.
-
-    SsdAnchorsCalculator: strides 8, 16 and three times 32, two anchors for each.
-    """
+    """Compute the anchor centres [2254, 2] of the person detector, as shares of its input."""
     grids = []
     for cells, each in ((28, 2), (14, 2), (7, 6)):
         centre = (np.arange(cells) + 0.5) / cells
@@ -310,16 +306,7 @@ def _anchors() -> Float:
 
 
 def _merged(points: Float, score: Float) -> Iterator[tuple[Float, np.float64]]:
-    """Merge all boxes that overlap the best one into one answer, then do the same with the rest.
-
-    Args:
-        points: [N, 6, 2] the centre and size of a box, then four points.
-        score: [N] 0..1.
-
-    Yields:
-        The first two of the four points [2, 2] (middle of the hips, top of the circle around the person),
-        averaged with the scores as weights, and the best score.
-    """
+    """Merge all boxes that overlap the best one into one answer, then do the same with the rest."""
     low, high = points[:, 0] - points[:, 1] / 2, points[:, 0] + points[:, 1] / 2
     area = np.prod(high - low, axis=1)
     left = np.argsort(-score, kind="stable")
@@ -336,10 +323,7 @@ def _merged(points: Float, score: Float) -> Iterator[tuple[Float, np.float64]]:
 
 
 def _region(centre: Float, top: Float) -> Region:
-    """Compute the square region around a person from the middle of the hips and the top of the body circle.
-
-    AlignmentPointsRectsCalculator and RectTransformationCalculator: upright means centre below top.
-    """
+    """Compute the square around a person from the middle of the hips and the top of the body circle."""
     right, down = top - centre
     return Region(
         centre=(float(centre[0]), float(centre[1])),
@@ -367,17 +351,7 @@ def _picture_from_crop(region: Region) -> Float:
 
 
 def _refined(in_crop: Float, heatmap: NDArray[np.floating[Any]]) -> tuple[Float, Float]:
-    """Refine positions to the weighted middle of the heatmap around them, and return its peak there.
-
-    RefineLandmarksFromHeatmapCalculator, 9 x 9 cells, for peaks of at least 0.5; others stay.
-
-    Args:
-        in_crop: [L, 2] crop pixels.
-        heatmap: [64, 64, L] logits, row first.
-
-    Returns:
-        The positions [L, 2] and the peaks [L] 0..1, 0 where a position lies outside the crop.
-    """
+    """Refine positions to the weighted middle of the heatmap around them, and return its peak there."""
     cell = np.trunc(in_crop / _CELL).astype(np.int64)[:, :, None] + np.arange(-4, 5)  # [L, xy, 9]
     exists = (cell >= 0) & (cell < _CELLS)
     x, y = np.moveaxis(np.clip(cell, 0, _CELLS - 1), 1, 0)

@@ -206,10 +206,7 @@ def median_of(values: Float, axis: int) -> Float:
 
 
 def _shifts(now: Float, before: Float, size: Float, wait_s: Float) -> Float:
-    """Compute shifts of bodies [..., J, 2] against earlier ones, by what is allowed; inf without a joint.
-
-    A body is about four sizes tall.
-    """
+    """Compute shifts of bodies [..., J, 2] against earlier ones, by what is allowed; inf without a joint."""
     moved = median_of(np.linalg.norm(now - before, axis=-1), axis=-1)
     shift = moved / np.maximum(4.0 * size, 1e-12) / (_SHIFT_HEIGHTS + wait_s)
     return np.where(np.isfinite(shift), shift, np.inf)
@@ -315,13 +312,7 @@ class _Pairs(NamedTuple):
 
 
 def _pairs(views: SightLines, seen: Bool, size: Float, piece: Int64, rows: Int64) -> _Pairs:
-    """Compare all detections of different cameras at some times.
-
-    The square is the mean over the better three quarters of the common joints: if a detector splits one
-    person in two, the body wins over the loose leg. Two rays o + z d pass each other along n = d_a x d_b, at
-    depths that follow from n (Hartley & Zisserman 12.1, the midpoint's); an angular error sigma moves a ray
-    by sigma z along n. Joints with almost parallel rays, which have no usable depth, do not count.
-    """
+    """Compare all detections of different cameras at some times."""
     cameras, detections = piece.shape[1:]
     camera = np.repeat(np.arange(cameras), detections)
     one, other = np.nonzero(camera[:, None] < camera)
@@ -408,10 +399,7 @@ class _Nodes(NamedTuple):
 
 
 def _partition(evidence: Float, apart: Bool, nodes: _Nodes, before: Int64 | None) -> Int64:
-    """Divide N nodes into bodies, the sum of evidence [N, N] inside of them as large as is found.
-
-    Nodes that are apart are never in one body. Of several beginnings the best end is taken.
-    """
+    """Divide N nodes into bodies, the sum of evidence [N, N] inside of them as large as is found."""
     tried = []
     begun = [_joined(evidence, apart), _in_order(evidence, apart, nodes)]
     for first in begun if before is None else [*begun, before]:
@@ -470,11 +458,7 @@ def _in_order(evidence: Float, apart: Bool, nodes: _Nodes) -> Int64:
 
 
 def _exchanged(evidence: Float, apart: Bool, nodes: _Nodes, body: Int64) -> Int64:
-    """Let stretches of one camera, or of all, change their bodies together, while the sum rises.
-
-    A wrong order of joining, or a single wrong piece in a meeting, kept the right ones apart. Stretches begin
-    and end where pieces that go on in a picture are in two bodies.
-    """
+    """Let stretches of one camera, or of all, change their bodies together, while the sum rises."""
     count = int(body.max(initial=-1)) + 1
     one, other = np.nonzero(evidence)
     worth = evidence[one, other]

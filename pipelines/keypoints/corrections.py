@@ -203,11 +203,7 @@ def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: fl
 
 
 def _with_visible_ends(t_s: Float, path: Bool, linked: Bool, crossing: Bool, cost: Float) -> Bool:
-    """Keep the runs of a path [R] that begin and end with a jump, and short ones with a single visible end.
-
-    The path has already chosen the crossing, or the end of the data, that makes such a run shortest. Longer
-    runs with a single visible end are dropped: the exchanged pictures could be those beyond the jump.
-    """
+    """Keep the runs of a path [R] that begin and end with a jump, and short ones with one visible end."""
     kept = path.copy()
     edges = np.flatnonzero(np.diff(path, prepend=False, append=False))
     for first, stop in edges.reshape(-1, 2):
@@ -241,20 +237,7 @@ def _body_size(xy: Float) -> float:
 
 
 def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[Float, Bool, float]:
-    """Compute the cost that each row adds to the length of a path.
-
-    Args:
-        t_s: [R] seconds.
-        left: [R, K, 2] joints labelled left.
-        right: [R, K, 2] joints labelled right.
-        least_noise: lower limit of the noise of positions, in their unit.
-
-    Returns:
-        Costs [R, 2, 2, 2, K] for the hypotheses two rows before, one before, and now: the squared errors of
-        prediction in units of their variance, large ones by their logarithm, of both joints of a pair; 0 in
-        the first two rows and after a gap. Then [R] True if a row follows the one before without a gap, so
-        that a change of hypothesis has a cost; and the noise of a coordinate.
-    """
+    """Compute the cost that each row adds to the length of a path."""
     step = np.diff(t_s)
     ratio = step[1:] / step[:-1]
     linked = np.concatenate([[False], step <= _MAX_GAP_S])
@@ -279,11 +262,7 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
 
 @cached
 def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bool:
-    """Find the hypotheses [R] of the shortest path through costs [R, 2, 2, 2] (Viterbi over pairs of rows).
-
-    A change before a row costs `change` [R], an exchanged row `exchanged`. Ties go to the path that stays
-    unexchanged longer.
-    """
+    """Find the hypotheses [R] of the shortest path through costs [R, 2, 2, 2] (Viterbi)."""
     rows = len(cost)
     length = np.empty((2, 2))  # by the hypotheses of the last row and of this one
     came = np.zeros((rows, 2, 2), np.int8)
@@ -414,11 +393,7 @@ def _wrong_views(xy: Float, position: Float, rotation: Float, sigma: Float, pair
 
 
 def _misses(rays: Float, seen: Bool, position: Float, sigma: Float) -> Float:
-    """Compute squared distances [T, K, 2, C] of rays from their common point, in variances; NaN if not seen.
-
-    A ray's error is its angular error times the distance. Also NaN for fewer than two rays, or if all are
-    parallel.
-    """
+    """Compute squared distances [T, K, 2, C] of rays from their common point, in variances; NaN if unseen."""
     weight = np.where(seen, 1 / sigma[:, None, None] ** 2, 0.0)
     rays = np.where(seen[..., None], rays, 0.0)
     origin = np.broadcast_to(np.nan_to_num(position)[:, None, None], rays.shape)

@@ -81,8 +81,7 @@ class OnnxOptions:
 def parse_options(argument: str) -> OnnxOptions:
     """Parse the text after the colon; a path may contain commas.
 
-    Raises:
-        DataError: an option is unknown, repeated, or has a value out of its range.
+    DataError: an option is unknown, repeated, or has a value out of its range.
     """
     parts = argument.split(",")
     first = next((i for i, part in enumerate(parts) if i and re.match(r"[a-z_]+=", part)), len(parts))
@@ -169,9 +168,8 @@ class OnnxNetwork:
         size: width and height of its input.
         shapes: shapes of the outputs, by name, for one picture.
 
-    Raises:
-        DataError: not a model that ONNX Runtime can run, or not one of a single picture as input; no such
-            provider.
+    DataError: not a model that ONNX Runtime can run, or not one of a single picture as input; no such
+    provider.
     """
 
     def __init__(
@@ -320,8 +318,7 @@ class PoseDecoder:
 def decoder_for(network: OnnxNetwork, cells: HeatmapCells) -> PoseDecoder:
     """Choose the decoder of a network's outputs from their shapes.
 
-    Raises:
-        DataError: they are of no known kind.
+    DataError: they are of no known kind.
     """
     width, height = network.size
     lines = {name: shape for name, shape in network.shapes.items() if len(shape) == 3}
@@ -349,10 +346,7 @@ def simcc_peaks(x: Float, y: Float) -> tuple[Float, Float]:
 
 
 def _line_peaks(scores: Float) -> tuple[Float, Float]:
-    """Find the tops [N, K] of parabolas around the best bins of [N, K, B], and the scores [N, K] there.
-
-    Least squares of a + b d + c d^2 to d = -2..2: b = sum(d s) / 10, c = sum((d^2 - 2) s) / 14.
-    """
+    """Find the tops [N, K] of parabolas around the best bins of [N, K, B], and the scores [N, K] there."""
     last = scores.shape[-1] - 1
     best = scores.argmax(axis=-1)
     offset = np.arange(-_REACH_BINS, _REACH_BINS + 1)
@@ -441,10 +435,8 @@ class OnnxPeople:
         """Find people in a picture [H, W, 3] BGR, best first.
 
         The picture is fitted into the top left of the network's input. The network counts from the edge of
-        the first pixel, the regions returned from its centre.
-
-        Raises:
-            DataError: the network's outputs are not [1, N, 5] boxes with scores, with or without labels.
+        the first pixel, the regions returned from its centre. DataError: the network's outputs are not [1, N,
+        5] boxes with scores, with or without labels.
         """
         width, height = self._network.size
         scale = max(picture.shape[1] / width, picture.shape[0] / height)
@@ -478,11 +470,7 @@ def _region_of(low: Float, high: Float, size: tuple[int, int]) -> Region:
 
 
 def _upright_crop(region: Region, size: tuple[int, int]) -> Float:
-    """Compute picture_from_crop [2, 3] for a region whose side becomes the crop's longer side.
-
-    Its middle becomes the middle of the crop's pixels, ((width - 1) / 2, (height - 1) / 2). MMPose puts it
-    half a crop pixel beside that, and its outputs as well, so that positions agree.
-    """
+    """Compute picture_from_crop [2, 3] for a region whose side becomes the crop's longer side."""
     scale = region.side / max(size)
     middle = np.array([size[0] - 1, size[1] - 1]) / 2
     return np.column_stack([np.eye(2) * scale, np.array(region.centre) - scale * middle])
@@ -590,16 +578,14 @@ class OnnxDetector:
     def fetch(self, source: Path | None = None) -> None:  # noqa: ARG002  # the protocol's
         """Refuse: the user's own models cannot be fetched.
 
-        Raises:
-            DataError: always.
+        DataError: always.
         """
         raise DataError("onnx", "is your own model", "write --detector onnx:MODEL.onnx")
 
     def load(self, *, threads: int) -> OnnxPose:
         """Load the networks; the results do not depend on `threads`.
 
-        Raises:
-            DataError: ONNX Runtime or a file is missing, or a model is of no known kind.
+        DataError: ONNX Runtime or a file is missing, or a model is of no known kind.
         """
         own = self.options
         norm = own.mean, own.std
@@ -639,8 +625,7 @@ class OnnxFamily:
     def configured(self, argument: str) -> OnnxDetector:
         """Build the detector from a model and its options.
 
-        Raises:
-            DataError: the file is missing, or an option is wrong.
+        DataError: the file is missing, or an option is wrong.
         """
         options = parse_options(argument)
         for path in (options.model, options.people):

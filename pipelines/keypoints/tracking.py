@@ -406,10 +406,7 @@ class PeopleTracker:
     def _locate(
         self, picture: Picture, regions: Sequence[Region], *, followed: bool = False
     ) -> list[Person | None]:
-        """Locate the person in each region, None if there is none.
-
-        Who is followed may have a low presence in a single picture: the joints' confidences are surer.
-        """
+        """Locate the person in each region, None if there is none."""
         if not regions:
             return []
         return [
@@ -432,10 +429,7 @@ class PeopleTracker:
         return [None if person is None else next(second) for person in first]
 
     def _locate_new(self, picture: Picture, region: Region, logged: Hints) -> Person | None:
-        """Locate a person twice; None for a thing that is no person, if somebody is seen already.
-
-        Who can be a logged person, and the first one, are judged by a few pictures instead.
-        """
+        """Locate a person twice; None for a thing that is no person, if somebody is seen already."""
         for _ in range(2):
             (person,) = self._locate(picture, [region])
             if person is None:

@@ -303,11 +303,7 @@ def _best(
     names: Sequence[str],
     shared: Bool | None,
 ) -> dict[str, Any] | None:
-    """Find the arms that no other one beats; None if fewer than two of these measured anything.
-
-    One arm beats another if it is better in one figure and worse in none. Arms that violate a limit are left
-    out, unless all do.
-    """
+    """Find the arms that no other one beats; None if fewer than two of these measured anything."""
 
     def right(name: str) -> float:
         return float((arms[name]["reconstruction_error"]["pck150"] or {}).get("mean") or 0.0)

@@ -196,8 +196,7 @@ _ADAPTER = TypeAdapter(PlannerConfig)
 def planner_config(values: Mapping[str, object], source: Path | str = "planner settings") -> PlannerConfig:
     """Read settings from a mapping, as from YAML; keys that are missing keep their defaults.
 
-    Raises:
-        DataError: unknown keys, values of another type, or out of range; every problem in one message.
+    DataError: unknown keys, values of another type, or out of range; every problem in one message.
     """
     problems = []
     for key in values:

@@ -39,8 +39,7 @@ class ActorFilter:
     def measure(self, t_s: float, position: Float) -> None:
         """Update with one measured position [3], metres, world, not earlier than the last one.
 
-        Raises:
-            ValueError: the time goes backwards, or the position is not finite.
+        ValueError: the time goes backwards, or the position is not finite.
         """
         if not np.isfinite(position).all():
             raise ValueError("a measured position must be finite: leave out what was not measured")
@@ -60,10 +59,8 @@ class ActorFilter:
     def at(self, t_s: float) -> tuple[Float, Float, Float]:
         """Predict the state (position m, velocity m/s, [3] each) and covariance [2, 2] per axis.
 
-        The time must be at or after the last measurement.
-
-        Raises:
-            ValueError: nothing was measured yet, or the time is before the last measurement.
+        The time must be at or after the last measurement. ValueError: nothing was measured yet, or the time
+        is before the last measurement.
         """
         state, covariance = self._predicted(t_s)
         return state[0], state[1], covariance

@@ -91,11 +91,9 @@ class Replay:
 class Pilot:
     """One arm in flight. Call `measure` at each measurement and `replan` at the tracking rate.
 
-    Central planning, local planning and tracking have the rates of the configuration, counted from the
-    first call. Drones plan one after the other, each with the latest plans of the others.
-
-    Raises:
-        ValueError: an impossible number of drones.
+    Central planning, local planning and tracking have the rates of the configuration, counted from the first
+    call. Drones plan one after the other, each with the latest plans of the others. ValueError: an impossible
+    number of drones.
     """
 
     def __init__(
@@ -254,8 +252,7 @@ def replay(
         fields: the maps by the time from which they hold; before the first one nothing is known.
         weights: of the people.
 
-    Raises:
-        ValueError: times that do not ascend, fewer than two measurements, an impossible number of drones.
+    ValueError: times that do not ascend, fewer than two measurements, an impossible number of drones.
     """
     people = actor if actor.ndim == 3 else actor[:, None]
     measured_then = np.isfinite(people.sum(axis=2))  # [A, P]

@@ -124,10 +124,8 @@ def load_flight(
     """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
     `reconstructed` is the record of stage `reconstruct`, `pose_noise` replaces the errors stated in the
-    session.
-
-    Raises:
-        DataError: the actor's position is unknown, or not while the cameras flew; an unknown noise model.
+    session. DataError: the actor's position is unknown, or not while the cameras flew; an unknown noise
+    model.
     """
     warnings: list[str] = []
     skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
@@ -436,8 +434,7 @@ class ReplanSettings:
 def replan_settings(values: Mapping[str, object], source: Path | str, **others: Any) -> ReplanSettings:
     """Make settings of a mapping, as from YAML: those of the planner, and `yaw_deg`.
 
-    Raises:
-        DataError: a setting is unknown or out of range.
+    DataError: a setting is unknown or out of range.
     """
     planner = dict(values)
     own: dict[str, Any] = {}

@@ -476,11 +476,7 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
 
 @contextmanager
 def _settled(drawing: Drawing, scale: float = 1.0) -> Iterator[None]:
-    """Lay a drawing out at a scale of its size and hold that layout; call it within `page_style`.
-
-    The layout's solver leaves the last bits of coordinates open; rounded, the same figure gives the same
-    bytes.
-    """
+    """Lay a drawing out at a scale of its size and hold that layout; call it within `page_style`."""
     size_in = drawing.get_size_inches()
     drawing.set_size_inches(*(scale * size_in))
     for axes in drawing.axes:  # undo the positions of an earlier layout
@@ -528,10 +524,7 @@ def _inline_svg(figure: Figure) -> str:
 
 
 def _time_axes(drawing: Drawing) -> str:
-    """Describe the time axes for the viewer: left and right edge in the drawing, the times there, its height.
-
-    A column of panels shares one axis of time, from the top of the first to the bottom of the last.
-    """
+    """Describe the time axes for the viewer: left and right edge in the drawing, times, height."""
     width, height = 72 * drawing.get_size_inches()  # the unit of matplotlib's SVG is a point
     parts = []
     for axes in drawing.axes:
@@ -685,9 +678,8 @@ def write_drawing(folder: Path, name: str, figure: Figure) -> list[str]:
 def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
     """Refuse to write figures over what is not ours; with `overwrite` only over sessions and their parts.
 
-    Raises:
-        DataError: a session, a part of one, or a folder that contains one; a file, or a folder that contains
-            more than figures that were written before.
+    DataError: a session, a part of one, or a folder that contains one; a file, or a folder that contains more
+    than figures that were written before.
     """
     refuse_sessions(folder, mark=MARK, option="--figures")
     if overwrite or not folder.exists():

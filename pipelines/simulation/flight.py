@@ -126,8 +126,7 @@ def build_set(scenario: Scenario, *, bvh: Mapping[str, SkeletalMotion] | None = 
     Args:
         bvh: recorded motions by the name of the actor whose scenario names one.
 
-    Raises:
-        DataError: the world cannot be built, or a motion is not that of a person.
+    DataError: the world cannot be built, or a motion is not that of a person.
     """
     people = []
     for index, (name, look) in enumerate(scenario.people.items()):
@@ -153,9 +152,8 @@ def fly_scenario(
         planner: makes a planner for a world; without one drones fly on a ring about where the first actor
             truly is, whatever stands in the way.
 
-    Raises:
-        DataError: the world cannot be built, a motion is not that of a person, or the flight is over
-            before a drone takes its first picture.
+    DataError: the world cannot be built, a motion is not that of a person, or the flight is over before a
+    drone takes its first picture.
     """
     set_up = build_set(scenario, bvh=bvh)
     world, followed = set_up.world, set_up.people[0]

@@ -242,10 +242,7 @@ class _Flight(NamedTuple):
 
     @classmethod
     def starting(cls, position: Float, velocity: Float, t_s: Float, limits: Limits) -> _Flight:
-        """Return a flight with all drones at [N, 1, 3], not yet flown.
-
-        Velocities [N, 1, 3] are cut to the limits.
-        """
+        """Return a flight with all drones at [N, 1, 3], not yet flown."""
         speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
         allowed = velocity * (limits.speed_mps / np.maximum(speed, limits.speed_mps))
         rows = (1, len(t_s), 1)

@@ -282,10 +282,7 @@ class DistortingLens:
     """A lens that bends the light of a pinhole with the same focal length.
 
     Light is interpolated by cubics before it is developed, so that the sensor's softness and noise are those
-    of a picture without distortion.
-
-    Raises:
-        ValueError: the distortion's model does not reach the whole picture.
+    of a picture without distortion. ValueError: the distortion's model does not reach the whole picture.
     """
 
     pinhole: Intrinsics
@@ -482,9 +479,8 @@ class Renderer:
         sun: [3] direction towards it, of any length.
         seed: of the ground's texture and of the sensor's noise.
 
-    Raises:
-        ValueError: distortion whose model does not reach the whole picture, or a sun that is not above the
-            horizon.
+    ValueError: distortion whose model does not reach the whole picture, or a sun that is not above the
+    horizon.
     """
 
     def __init__(

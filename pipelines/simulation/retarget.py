@@ -51,10 +51,8 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
     Names are compared without prefix (`mixamorig:`, `Bip01_`), case and separators; a side is `left`,
     `right`, or a lone `l` or `r` before or after. The trunk is the chain from the pelvis to the bone that
     both arms hang on; spine, back and chest are its first, middle and last bone. A part that the source lacks
-    moves with its parent: toes with the foot, hands with the forearm, clavicles with the chest.
-
-    Raises:
-        DataError: essential bones were not found; the message lists them and the source's bones.
+    moves with its parent: toes with the foot, hands with the forearm, clavicles with the chest. DataError:
+    essential bones were not found; the message lists them and the source's bones.
     """
     named: dict[tuple[str, str], int] = {}
     for index, name in enumerate(source.bones):
@@ -180,8 +178,7 @@ def retarget(
         heading_deg: counterclockwise from east.
         repeat: begin again where it ended; the last half second is bent to the first pose.
 
-    Raises:
-        DataError: the bones of a person were not found, or a leg of the source has no length.
+    DataError: the bones of a person were not found, or a leg of the source has no length.
     """
     match = match_bones(source)
     source = _without_first_pose(source)

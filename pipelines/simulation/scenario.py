@@ -406,9 +406,8 @@ class Scenario(YamlModel):
 def read_scenario(path: Path) -> Scenario:
     """Read and validate a scenario.
 
-    Raises:
-        DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
-            every problem that was found.
+    DataError: the file is missing, no YAML, or does not keep to the schema; the message holds every problem
+    that was found.
     """
     scenario = read_yaml_model(
         path,

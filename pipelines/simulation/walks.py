@@ -351,8 +351,7 @@ class StudiedNoise:
     def models(self) -> list[NoiseModel]:
         """Parse the noise models.
 
-        Raises:
-            DataError: the text is not a noise model, or a name is unknown.
+        DataError: the text is not a noise model, or a name is unknown.
         """
         return parsed_noise_models("noise", self.model) if self.model else []
 
@@ -380,8 +379,7 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
         stated: variable (of `KNOWN`) to its values, as users write them. `noise` has names of `LEVELS` (white
             noise), or models as `--pose-noise` has them.
 
-    Raises:
-        DataError: an unknown name, a value given twice, or a number out of range.
+    DataError: an unknown name, a value given twice, or a number out of range.
     """
     values = {**_USUAL, "rate_hz": (), **stated}
     unknown = [name for name in values if name not in KNOWN]
@@ -453,8 +451,7 @@ def numbers(
 ) -> list[Any]:
     """Read the numbers of a variable.
 
-    Raises:
-        DataError: one is no number, out of range (NaN, too), or given twice.
+    DataError: one is no number, out of range (NaN, too), or given twice.
     """
     texts = values.get(name) or default
     try:

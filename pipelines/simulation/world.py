@@ -180,8 +180,7 @@ def plant(
         standing: trees that are there already; new ones keep apart from them and from each other.
         walls: new trees keep their trunks out of them.
 
-    Raises:
-        DataError: they do not fit.
+    DataError: they do not fit.
     """
     trees = list(standing)
     for planted in range(wood.count):
@@ -263,11 +262,9 @@ def erect(
     """Stand trees and walls on the ground.
 
     A tree's crown is the upper 62 % of its height; its trunk, 3 % of the height in radius, ends in the
-    crown's middle. A wall is level on top, `height_m` above the highest ground under its line, so that it
-    is nowhere lower. Both reach below the lowest ground that they stand on.
-
-    Raises:
-        DataError: a wall begins where it ends.
+    crown's middle. A wall is level on top, `height_m` above the highest ground under its line, so that it is
+    nowhere lower. Both reach below the lowest ground that they stand on. DataError: a wall begins where it
+    ends.
     """
     return Obstacles(
         np.array([_trunk(terrain, tree) for tree in trees]).reshape(-1, 5),
@@ -671,11 +668,8 @@ def _range(low_m: float, high_m: float, side: float, first: int, count: int) -> 
 def build_world(spec: scenario.WorldSettings, seed: int, *, keep_clear: Float) -> World:
     """Raise the mounds, plant the wood, stand trees and walls on the ground.
 
-    `keep_clear` [K, 2] m are points of the actor's way, which the wood keeps clear of. Trees with a place
-    in the scenario stand at that place.
-
-    Raises:
-        DataError: the wood does not fit, or a wall has no length.
+    `keep_clear` [K, 2] m are points of the actor's way, which the wood keeps clear of. Trees with a place in
+    the scenario stand at that place. DataError: the wood does not fit, or a wall has no length.
     """
     terrain = raise_mounds(spec.mounds)
     trees = list(spec.trees)
