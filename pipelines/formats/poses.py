@@ -393,7 +393,7 @@ def _is_csv(head: str) -> bool:
 def _read_csv(path: Path) -> Trajectory:
     """Read every pose below a heading of any order, separated by commas, semicolons or tabs.
 
-    Needed: a time (t_ns, or t, time, timestamp, stamp in seconds or with a unit, or sec and nanosec), x y z
+    Needed: a time (t_ns, or t, time, timestamp, stamp in seconds or with a unit), x y z
     (also tx, p_x, pos_x, position_x), qx qy qz qw (also q_x, orientation_x, q_RS_x). Optional: the covariance
     c00..c55, upper triangle, position in world and rotation vector in body. Other columns are ignored.
     """

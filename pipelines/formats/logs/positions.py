@@ -16,7 +16,7 @@ from pipelines.formats.logs.messages import FAULTS, LoggedRows, Stamps, nanoseco
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes
-from pipelines.session.records import Message, PositionTrack, Telemetry, Topic
+from pipelines.session.records import PositionTrack, Telemetry, Topic
 from pipelines.session.registries import Log
 
 FIXES = (
@@ -32,11 +32,6 @@ FIXES = (
 _NO_FIX = -1
 _AIRSIM = re.compile(r"(^|/)airsim_node/[^/]+/odom_local_ned$")
 _TURNED = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped")
-_POSES = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "nav_msgs/msg/Odometry",
-)
 
 
 def axes_of_topic(topic: str | None, parent: str | None) -> Axes | None:
@@ -75,7 +70,7 @@ def read_pair(
     dropped: dict[str, int] = {}
     notes: list[str] = []
     track = read_positions(recording, source, position, stamps, dropped, notes)
-    rows = _read(recording, source, attitude, "attitude", (*_TURNED, *_POSES), _quaternion_of)
+    rows = _read(recording, source, attitude, _quaternion_of)
     notes += rows.notes(f"{source} {attitude}", stamps)
     turned = rows.values
     if axes == "ned":
@@ -96,8 +91,7 @@ def read_positions(
 ) -> PositionTrack:
     """Read a topic of positions alone; unusable rows are counted in `dropped`, steps told in `notes`."""
     is_fix = next(known.type for known in recording.topics if known.name == topic) in FIXES
-    types = (*FIXES, "geometry_msgs/msg/PointStamped", *_POSES)
-    rows = _read(recording, source, topic, "position", types, _fix_of if is_fix else _point_of)
+    rows = _read(recording, source, topic, _fix_of if is_fix else _point_of)
     if notes is not None:
         notes += rows.notes(f"{source} {topic}", stamps)
     values = rows.values
@@ -123,8 +117,6 @@ def _read(
     recording: Log,
     source: str,
     topic: str,
-    noun: str,
-    types: Sequence[str],
     numbers: Callable[[Any], Sequence[float]],
 ) -> LoggedRows:
     """Read the numbers of every message of a topic."""
@@ -139,7 +131,7 @@ def _read(
             receive_ns.append(message.receive_ns)
             values.extend(row)
         except FAULTS as error:
-            raise _no_such(recording, source, message, error, noun, types) from error
+            raise unreadable(message, source, error) from error
     if not len(header_ns):
         raise DataError(source, f"topic {topic} holds no message", "name another")
     return LoggedRows(
@@ -147,22 +139,6 @@ def _read(
         np.frombuffer(receive_ns, np.int64),
         np.frombuffer(values, np.float64).reshape(len(header_ns), -1),
     )
-
-
-def _no_such(
-    recording: Log, source: str, message: Message, error: Exception, noun: str, types: Sequence[str]
-) -> DataError:
-    """Return the error for a message: its type has no such data, or else its own fault."""
-    topic = message.topic
-    if isinstance(error, AttributeError) and topic.type not in types:
-        there = [known.name for known in recording.topics if known.type in types]
-        named = ", ".join(type_.rpartition("/")[2] for type_ in types)
-        return DataError(
-            source,
-            f"topic {topic.name} holds {topic.type}, no {noun} that can be read",
-            f"name a topic of {named}: {', '.join(sorted(there)) or 'this log has none'}",
-        )
-    return unreadable(message, source, error)
 
 
 def _point_of(value: Any) -> Sequence[float]:

@@ -39,7 +39,7 @@ import numpy as np
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.refusals import bad_value, damaged, empty
-from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints
+from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints, describe_motion
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.poses import (
     conjugate,
@@ -90,7 +90,7 @@ class _BvhFile:
 
 
 class BvhFormat:
-    """Reader of the joints at which bones begin; the description is in the file's own, unstated unit.
+    """Reader of the joints at which bones begin.
 
     Known bones get our joints' names (LeftUpLeg and lfemur are left_hip), others keep theirs.
     """
@@ -104,22 +104,8 @@ class BvhFormat:
         return read_head(path, self.suffixes).split(maxsplit=2)[:2] == ["HIERARCHY", "ROOT"]
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Describe bones, frames, rate, seconds, the extent of the rest pose, and the box of its root."""
-        contents = _read(path)
-        frames, bones = len(contents.values), contents.bones
-        places = _rest_places(bones)
-        place, _ = _bone_places(bones[0], contents.values)
-        return {
-            "bones": len(bones),
-            "root": bones[0].name,
-            "names": [bone.name for bone in bones],
-            "frames": frames,
-            "rate_hz": round(1 / contents.frame_time_s, 3),
-            "seconds": round((frames - 1) * contents.frame_time_s, 6),
-            "rest_pose_extent": [round(v, 4) for v in np.ptp(places, axis=0).tolist()],
-            "root_box_min": [round(v, 4) for v in place.min(axis=0).tolist()],
-            "root_box_max": [round(v, 4) for v in place.max(axis=0).tolist()],
-        }
+        """Describe joints, frames and the box as if in metres."""
+        return describe_motion(self.read_joints(path, unit="m", axes=None))
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
         """Read every frame, the first at 0 s; `axes` is y-up unless stated.

@@ -6,7 +6,6 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -251,8 +250,10 @@ class FolderPictures:
         try:
             content = np.fromfile(self.files[number], dtype=np.uint8)
             # The header tells the size: OpenCV takes gigabytes for a picture of a few bytes.
-            with _silence(), Image.open(self.files[number]) as header:
-                small = math.prod(header.size) <= _MOST_PIXELS
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of damaged tags and of large pictures
+                with Image.open(self.files[number]) as header:
+                    small = math.prod(header.size) <= _MOST_PIXELS
             picture = cv2.imdecode(content, cv2.IMREAD_COLOR) if small else None
         except (OSError, ValueError, SyntaxError, cv2.error, Image.DecompressionBombError):
             return None
@@ -267,14 +268,6 @@ class FolderPictures:
             picture = self.read(number)
             if picture is not None:
                 yield number, picture
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep Pillow's warnings of damaged tags and of large pictures off the terminal."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 PICTURES = PictureFolder()

@@ -105,10 +105,6 @@ class VideoContainer:
     def describe(self, path: Path) -> dict[str, object]:
         """Describe frames, times, rate, gaps, picture size, codec, and losses."""
         index = self.index(path)
-        if index.codec == UNTIMED:
-            picture = f"{index.width} x {index.height} px"
-            dropped = {f"dropped: {cause}": count for cause, count in index.dropped.items()}
-            return {"frames": index.count, "times": "none: a raw stream", "picture": picture, **dropped}
         times = describe_times(index.pts_ns)
         return {
             "frames": index.count,
@@ -121,7 +117,6 @@ class VideoContainer:
             "picture": f"{index.width} x {index.height} px",
             "turned_deg": index.rotation_deg,
             "codec": index.codec,
-            **({"data_tracks": tracks} if (tracks := data_tracks(path)) else {}),
             **({"notes": list(index.notes)} if index.notes else {}),
             **{f"dropped: {cause}": count for cause, count in index.dropped.items()},
         }
@@ -142,17 +137,6 @@ def index_video(path: Path) -> VideoIndex:
     """
     with VideoReader(path) as reader:
         return reader.index
-
-
-def data_tracks(path: Path) -> list[str]:
-    """Name the tracks beside pictures and sound by the names in the file: GoPro MET, DJI meta, ..."""
-    container, _ = open_container(path)
-    with container:
-        return [
-            f"{stream.metadata.get('handler_name', '').strip()} {stream.name or ''}".strip()
-            for stream in container.streams
-            if stream.type == "data"
-        ]
 
 
 def created_ns(path: Path) -> int | None:
