@@ -40,7 +40,6 @@ from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import all_samples, header_ns, kind_of, samples
 from pipelines.formats.logs.positions import FIXES, pairs_of
 from pipelines.formats.logs.trajectories import attitudes_of, poses_of
-from pipelines.formats.poses import times_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import FolderPictures
 from pipelines.formats.videos.video import VideoReader, created_ns, index_video
@@ -165,9 +164,7 @@ def draft(
         if problem:
             search.left_out[path] = problem
         progress.advance()
-    kitti = [each.path for each in found if isinstance(each, Proposal) and each.type == "kitti"]
-    for path in (_absolute(target), *map(times_of, kitti)):
-        search.left_out.pop(path, None)
+    search.left_out.pop(_absolute(target), None)
     if not found:
         path, reason = home, f"holds nothing that can be used ({len(search.left_out)} files)"
         if len(search.left_out) == 1:

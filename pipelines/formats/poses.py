@@ -1,13 +1,8 @@
-"""Trajectories as text: TUM, KITTI, and CSV with a heading.
+"""Trajectories as text: TUM, CSV with a heading, and AirSim's recording.
 
 TUM: `t x y z qx qy qz qw`, one pose per line, t in seconds (TUM RGB-D benchmark). Some writers keep the
 layout but change the order. They name it in a line above the numbers, such as
 `# timestamp tx ty tz qw qx qy qz`.
-
-KITTI: twelve numbers a line, world_from_camera as 3 x 4 by rows (or sixteen, with 0 0 0 1). Its world is that
-of the first camera: x right, y down, z forward. It is turned to x right, y forward, z up. The times are
-seconds, one a line, in a file beside the poses (`times.txt`, or `NAME_times.txt` for `NAME.txt`), or where
-the data set has them: `sequences/NAME/times.txt` for `poses/NAME.txt`.
 """
 
 from __future__ import annotations
@@ -41,7 +36,6 @@ from pipelines.formats.common.rows import (
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.mounting import attitude_in_enu
-from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import Recording, Trajectory
 from pipelines.session.storage import read_text
@@ -319,68 +313,6 @@ def _joint_tracks(recording: Recording) -> dict[str, Trajectory]:
 
 
 TUM_EXPORT = TumExport()
-
-
-# --- KITTI: twelve numbers a line, or sixteen ----------------------------------------------------------
-
-_LAST_ROW = [0.0, 0.0, 0.0, 1.0]  # of a 4 x 4 matrix
-_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # from x right, y down, z forward
-# Rounding of a matrix' numbers explains R R' up to this far from the identity.
-_ORTHOGONAL = 1e-2
-
-
-def _is_kitti(head: str) -> bool:
-    """Return True if the first line is twelve or sixteen numbers whose upper left part is a rotation."""
-    numbers = _numbers_of(head.lstrip().split("\n", 1)[0])
-    if numbers[12:] not in ([], _LAST_ROW) or len(numbers) < 12:
-        return False
-    return bool(_is_rotation(np.array(numbers[:12]).reshape(1, 3, 4)[:, :, :3])[0])
-
-
-def _read_kitti(path: Path) -> Trajectory:
-    """Read every pose; row k has the time of line k of the file of times."""
-    text = read_text(path).strip()
-    columns = 16 if len(text.split("\n", 1)[0].split()) == 16 else 12
-    names = {str(column): column for column in range(12)}
-    table = parse_table(path, text, delimiter=" ", columns=columns, text={}, numbers=names, first_line=1)
-    rows = table.stack([*names]).reshape(-1, 3, 4)
-    times = times_of(path)
-    t_ns, readable = parse_stamps(times, read_text(times).split())
-    if len(t_ns) < len(rows):
-        problem = f"has {len(t_ns)} times for {len(rows)} poses"
-        raise DataError(times, problem, "give the times of this trajectory")
-    turned = _is_rotation(rows[:, :, :3])
-    upright = np.where(turned[:, None, None], rows[:, :, :3], np.eye(3))
-    quaternion = quaternion_from_matrix(_WORLD @ upright)
-    quaternion[~turned] = np.nan
-    with np.errstate(invalid="ignore"):  # an infinite number is dropped with its row
-        position = rows[:, :, 3] @ _WORLD.T
-    count = len(rows)
-    return clean_poses(path, t_ns[:count], readable[:count], position, quaternion, truncated=table.truncated)
-
-
-def _is_rotation(matrices: Float) -> Bool:
-    with np.errstate(over="ignore", invalid="ignore"):
-        products = matrices @ matrices.transpose(0, 2, 1)
-        near = np.abs(products - np.eye(3)).max(axis=(1, 2)) < _ORTHOGONAL
-        return np.asarray(near & (np.linalg.det(np.nan_to_num(matrices)) > 0), dtype=np.bool_)
-
-
-def times_of(path: Path) -> Path:
-    """Return the file with the times of a trajectory; raise DataError without one."""
-    places = (
-        path.with_name("times.txt"),
-        path.with_name(f"{path.stem}_times.txt"),
-        path.parent.parent / "sequences" / path.stem / "times.txt",
-    )
-    found = next((place for place in places if place.is_file()), None)
-    if found is None:
-        remedy = "put KITTI's times.txt beside it, or save it as TUM"
-        raise DataError(path, "is a KITTI trajectory without times", remedy, code="clock-unknown")
-    return found
-
-
-KITTI = TrajectoryFile("kitti", "KITTI trajectory", (".txt", ".kitti"), _is_kitti, _read_kitti)
 
 
 # --- CSV with a heading --------------------------------------------------------------------------------

@@ -187,16 +187,6 @@ def test_logs_of_which_one_has_simulation_time_are_ordered_by_receipt(tmp_path: 
     assert len(ingest(result.path).description.cameras) == 2
 
 
-def test_files_that_are_read_with_others_are_not_left_out(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "drone1")
-    rows = [f"1 0 0 {k} 0 1 0 0 0 0 1 0" for k in range(FRAMES)]
-    (tmp_path / "drone1.txt").write_text("\n".join(rows), encoding="utf-8")
-    (tmp_path / "times.txt").write_text("\n".join(str(k / 30) for k in range(FRAMES)), encoding="utf-8")
-    result, stated = drafted(tmp_path)
-    assert result.left_out == {}
-    assert stated["cameras"]["drone1"]["pose"] == "drone1.txt"
-
-
 def test_a_map_in_the_frame_of_the_poses_is_drafted(tmp_path: Path) -> None:
     entries = [*poses("/drone1/pose", 0), grid_entry(np.full((4, 4), 100, np.int8), START_NS)]
     write_mcap(tmp_path / "flight.mcap", sorted(entries, key=lambda entry: entry.stamp_ns))

@@ -391,7 +391,6 @@ def _tables() -> Iterator[_Input]:
     row = "1700000000.0 0 0 0 0 0 0 1\n"
     for name, entry, good in (
         ("tum", "a.tum", row),
-        ("kitti", "00.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
         ("csv", "poses.csv", "t_ns,x,y,z,qw,qx,qy,qz\n1,0,0,0,1,0,0,0\n"),
     ):
         separator = "," if name == "csv" else " "

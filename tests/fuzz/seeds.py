@@ -27,7 +27,7 @@ from tests.formats.exported import flown, recording, walking
 from tests.formats.keypoint_files import test_coco_results, test_mmpose, test_other_programs
 from tests.formats.log_entries import entries
 from tests.formats.maps import test_grid_npz, test_las, test_octomap, test_pcd, test_ply, test_ros_map
-from tests.formats.poses import test_kitti, test_pose_csv
+from tests.formats.poses import test_pose_csv
 from tests.formats.skeletons import test_bvh, test_c3d, test_trc
 from tests.formats.videos import test_picture_folder
 from tests.synthetic import drone_logs, logs, map_logs, video_tracks, videos
@@ -152,7 +152,6 @@ SEEDS: dict[str, Writer] = {
     "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
     "joints_csv": lambda folder: joint_files.write_joints(folder / "joints.csv", walking(4)),
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
-    "kitti": test_kitti.write,
     "las": lambda folder: test_las.write(folder / "a.las"),
     "las, compressed": lambda folder: test_las.write(folder / "a.laz"),
     "map log": _map_log,
