@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.formats.calibrations import colmap
 from pipelines.geometry.cameras import project
+from pipelines.session.errors import DataError
 from pipelines.session.registries import CalibrationFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 
 READER: CalibrationFormat = colmap.FORMAT
@@ -106,7 +107,7 @@ def test_a_binary_model_that_is_cut_off_or_states_wrong_counts_is_refused(
     whole = (tmp_path / name).read_bytes()
     for content in (whole[: len(whole) - 5], struct.pack("<Q", 2**62) + whole[8:]):
         (tmp_path / name).write_bytes(content)
-        with refuses(tmp_path):
+        with refused("damaged", tmp_path):
             READER.read_calibration(tmp_path)
     assert capfd.readouterr() == ("", "")
 
@@ -136,5 +137,5 @@ def write(folder: Path, cameras: str = CAMERAS, images: str = IMAGES) -> Path:
     ],
 )
 def test_faulty_text_is_refused(tmp_path: Path, cameras: str, images: str) -> None:
-    with refuses(write(tmp_path, cameras, images)):
+    with pytest.raises(DataError):
         READER.read_calibration(tmp_path)

@@ -11,8 +11,8 @@ import pytest
 from pipelines.formats.calibrations import calibration_files
 from pipelines.geometry.arrays import Intrinsics
 from pipelines.geometry.cameras import project
-from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, CalibrationFormat
+from tests.raising import refused
 from tests.real_data import real_data
 
 READER: CalibrationFormat = calibration_files.CAMERA_INFO
@@ -99,31 +99,19 @@ def test_both_forms_project_as_opencv_does(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "problem"),
+    ("code", "keys"),
     [
-        ({"distortion_model": "ftheta"}, "distortion model 'ftheta'"),
-        ({"image_width": None, "camera_matrix": None}, "lacks image_width, camera_matrix"),
-        ({"image_width": "wide"}, "image_width, image_height is no list of numbers"),
-        ({"image_width": "0"}, "picture size"),
-        ({"camera_matrix": "[1, 2, 3]"}, "camera_matrix.data is no list"),
-        ({"camera_matrix": "{rows: 3, cols: 3, data: [1, 2, 3]}"}, "is 3 x 3 but has 3 numbers"),
-        ({"camera_matrix": "{rows: -3, cols: -3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}"}, "no rows and cols"),
-        ({"distortion_coefficients": "{rows: true, cols: 5, data: [0, 0, 0, 0, 0]}"}, "no rows and cols"),
-        ({"camera_matrix": f"{{rows: 1{'0' * 40}, cols: 0, data: []}}"}, "has no 3 x 3 matrix"),
-        ({"camera_matrix": "{rows: 3, cols: 3, data: [0, 0, 0, 0, 0, 0, 0, 0, 0]}"}, "not fx 0 cx"),
-        (
-            {"distortion_coefficients": "{rows: 900000000000, cols: 5, data: [0, 0, 0, 0, 0]}"},
-            "has 5 numbers",
-        ),
-        ({"camera_name": "[1, 2"}, "is no valid YAML"),
-        ({"camera_name": "&a [*a]"}, None),
+        ("data", {"distortion_model": "ftheta"}),
+        ("missing-column", {"image_width": None}),
+        ("bad-value", {"image_width": "wide"}),
+        ("damaged", {"image_width": "0"}),
+        ("damaged", {"camera_matrix": "{rows: 3, cols: 3, data: [1, 2, 3]}"}),
+        ("damaged", {"distortion_coefficients": "{rows: true, cols: 5, data: [0, 0, 0, 0, 0]}"}),
+        ("data", {"camera_matrix": "{rows: 3, cols: 3, data: [0, 0, 0, 0, 0, 0, 0, 0, 0]}"}),
+        ("damaged", {"distortion_coefficients": "{rows: 900000000000, cols: 5, data: [0, 0, 0, 0, 0]}"}),
     ],
 )
-def test_faulty_content_is_refused(tmp_path: Path, keys: dict[str, str | None], problem: str | None) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, code: str, keys: dict[str, str | None]) -> None:
     path = stored(tmp_path / "c.yaml", **keys)
-    if problem is None:
-        assert len(READER.read_calibration(path)) == 1
-        return
-    with pytest.raises(DataError, match=problem) as caught:
+    with refused(code, path):
         READER.read_calibration(path)
-    assert "\n" not in str(caught.value)

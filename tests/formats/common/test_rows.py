@@ -12,7 +12,7 @@ from pipelines.formats.common.rows import (
     parse_stamps,
     parse_table,
 )
-from tests.formats.refusals import refuses
+from tests.raising import refused
 
 # An epoch stamp in float64 seconds has no room for nanoseconds (its step is 0.2 us).
 
@@ -32,7 +32,7 @@ def test_a_stamp_that_no_float_can_hold_survives() -> None:
     ],
 )
 def test_epoch_stamps_that_are_not_seconds_are_refused(stamp: str, word: str) -> None:
-    with refuses("log", word):
+    with refused("data", "log", word):
         parse_stamps("log", [stamp, stamp])
 
 
@@ -60,5 +60,5 @@ def test_commas_are_decimal_where_they_separate_nothing() -> None:
         return float(table.numbers["b"][0])
 
     assert read("1,5;2,25\n-3;4e-1\n") == 2.25
-    with refuses("a.csv", 2):  # dots and commas in one row
+    with refused("data", "a.csv", 2):  # dots and commas in one row
         read("1.5;2,25\n1.5;2.5\n")

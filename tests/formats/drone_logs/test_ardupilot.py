@@ -13,7 +13,7 @@ from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     BOOT_NS,
@@ -125,9 +125,9 @@ def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[
     assert len(telemetry.position.t_ns) >= len(truth.t_ns) - 2
     assert capfd.readouterr().err == ""  # pymavlink prints each byte that it cannot read
     path.write_bytes(whole[:700])
-    with refuses(path, "POS", "XKF1", "NKF1", "GPS"):
+    with refused("no-positions", path, "POS", "XKF1", "NKF1", "GPS"):
         read(path)
     path.write_bytes(b"")
     assert not FORMAT.recognises(path)
-    with refuses(path, "ArduPilot"):
+    with refused("wrong-kind", path, "ArduPilot"):
         read(path)

@@ -12,7 +12,7 @@ from pipelines.formats.drone_logs.tlog import FORMAT
 from pipelines.geometry.poses import rotate
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import FORMATS, TelemetryChoice
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import DroneTruth, drone_of, mavlink, tlog_pictures, write_tlog
 from tests.synthetic.flights import write_flight
@@ -77,7 +77,7 @@ def test_without_gps_time_the_station_s_clock_counts(tmp_path: Path, truth: Dron
     assert np.abs(late_ns - 4_000_000_000).max() < 1_500_000  # the station's clock, and whole ms since boot
     assert telemetry.fit is None
     assert read(path, time="boot").position.t_ns[0] < 10**12
-    with refuses(path, "time: gps"):
+    with refused("clock-unknown", path, "time: gps"):
         read(path, time="gps")
 
 
@@ -146,7 +146,7 @@ def test_times_of_pictures(
         boot = FORMAT.picture_times(path, TelemetryChoice(time="boot"))
         assert boot.tolist() == (truth.boot_us * 1000).tolist()
     else:
-        with refuses(path, "time: boot"):
+        with refused("data", path, "time: boot"):
             FORMAT.picture_times(path, TelemetryChoice(time="boot"))
 
 

@@ -16,7 +16,7 @@ from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import conjugate, multiply
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     BOOT_NS,
@@ -114,7 +114,7 @@ def test_triggers(tmp_path: Path, truth: DroneTruth) -> None:
     np.testing.assert_array_equal(boot, truth.boot_us * 1000)
     rows = [row for row in ulog_rows(truth) if row[0] != "camera_trigger"]
     path = write_ulog(tmp_path / "b.ulg", rows)
-    with refuses(path, "camera_capture", "camera_trigger"):
+    with refused("data", path, "camera_capture", "camera_trigger"):
         FORMAT.picture_times(path, TelemetryChoice())
 
 
@@ -123,8 +123,8 @@ def test_definitions_that_unfold_without_end_are_refused(tmp_path: Path) -> None
     nested = [f"m{k}:m{k + 1}[60000] a;" for k in range(8)] + ["m8:float[60000] a;"]
     bomb = tmp_path / "bomb.ulg"
     bomb.write_bytes(head + b"".join(ulog_record("F", text.encode()) for text in nested))
-    with refuses(bomb, "fields"):
+    with refused("damaged", bomb, "fields"):
         read(bomb)
     bomb.write_bytes(head + ulog_record("F", b"loop:loop a;"))
-    with refuses(bomb, "loop"):
+    with refused("damaged", bomb, "loop"):
         read(bomb)

@@ -13,7 +13,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import get_skeleton
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import KeypointFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 
 KIND = "keypoint file"
@@ -62,7 +62,7 @@ def test_the_real_annotations_hold_what_is_known_of_them() -> None:
 def test_the_real_detections_are_refused_as_boxes_only() -> None:
     path = real_data("keypoints/coco_det_mmpose_AP_H_56.json")
     reader = recognise(path, KeypointFormat, KIND)
-    with refuses(path, 118):
+    with refused("no-keypoints", path, 118):
         reader.read_keypoints(path, skeleton=None, first_frame=0)
 
 

@@ -12,7 +12,7 @@ from pipelines.formats.keypoint_files.result_files import MMPOSE as FORMAT
 from pipelines.session.people import get_skeleton
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import FORMATS, KeypointFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 
 KIND = "keypoint file"
@@ -61,7 +61,7 @@ def test_a_demo_counts_from_one_and_names_its_joints(tmp_path: Path) -> None:
     assert found.frame.tolist() == [0, 1]
     other = {"keypoint_id2name": {str(index): f"h36m_{index}" for index in range(26)}}
     path = written(tmp_path / "other.json", content | {"meta_info": other})
-    with refuses(path, 26, "h36m_0"):
+    with refused("data", path, 26, "h36m_0"):
         FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
 
 

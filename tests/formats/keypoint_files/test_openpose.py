@@ -12,7 +12,7 @@ from pipelines.formats.keypoint_files.result_files import OPENPOSE as FORMAT
 from pipelines.session.people import take_joints
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import KeypointFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 
 KIND = "keypoint file"
@@ -101,26 +101,26 @@ def test_bad_folders_are_one_clear_line(tmp_path: Path) -> None:
         FORMAT.read_keypoints(tmp_path / name, skeleton=None, first_frame=0)
 
     (tmp_path / "empty").mkdir()
-    with refuses(tmp_path / "empty", "JSON"):
+    with refused("data", tmp_path / "empty", "JSON"):
         read("empty")
     assert not FORMAT.recognises(tmp_path / "empty")
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "cam.0001.json").write_text("{")
-    with refuses(tmp_path / "bad", 1, "JSON"):
+    with refused("data", tmp_path / "bad", 1, "JSON"):
         read("bad")
     frame_file(tmp_path / "nobody", "cam.0001.json")
     frame_file(tmp_path / "nobody", "cam.0002.json", {})
-    with refuses(tmp_path / "nobody", 2):
+    with refused("data", tmp_path / "nobody", 2):
         read("nobody")
     frame_file(tmp_path / "two", "cam1.0001.json", person())
     frame_file(tmp_path / "two", "cam2.0001.json", person())
-    with refuses(tmp_path / "two", "'cam1.0001'", "'cam2.0001'", 1):
+    with refused("data", tmp_path / "two", "'cam1.0001'", "'cam2.0001'", 1):
         read("two")
     frame_file(tmp_path / "mixed", "cam.0001.json", person())
     frame_file(tmp_path / "mixed", "cam.0002.json", person(count=25))
-    with refuses(f"{tmp_path / 'mixed' / 'cam.0002.json'}, people [0]", 25, 17):
+    with refused("data", f"{tmp_path / 'mixed' / 'cam.0002.json'}, people [0]", 25, 17):
         read("mixed")
-    with refuses(tmp_path / "absent"):
+    with refused("no-such-file", tmp_path / "absent"):
         read("absent")
 
 

@@ -13,7 +13,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.recognition import recognise
 from pipelines.session.records import Trajectory
 from pipelines.session.registries import LogFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 
 SECOND = 1_000_000_000
@@ -61,7 +61,7 @@ def test_a_plan_holds_until_the_next_one_begins(tmp_path: Path, container: Conta
 def test_what_is_no_plan_is_refused(tmp_path: Path) -> None:
     route = path_entry([(START, 0.0), (START, 1.0)])  # route planners give all points one stamp
     path = write_log(tmp_path, "route", "ros2-mcap", [route])
-    with refuses(path, "/sent", "plan", "times"):
+    with refused("data", path, "/sent", "plan", "times"):
         read(path)
     nothing = Entry("/sent", PATH, START, {"header": {"stamp": START}})
     with pytest.raises(DataError):

@@ -11,7 +11,7 @@ from pipelines.formats.logs import recordings
 from pipelines.formats.logs.messages import bytes_of
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import FORMATS, LogFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 
 LOGS = {
@@ -114,5 +114,5 @@ def test_pictures_in_json_are_bytes() -> None:
 
 def test_an_empty_file_is_refused_in_one_line() -> None:
     path = real_data("logs/ros1/foxglove_empty-file.bag")
-    with refuses(path, "0 bytes"):
+    with refused("damaged", path, "0 bytes"):
         recognise(path, LogFormat, "log").open_log([path])

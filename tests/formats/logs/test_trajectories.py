@@ -22,7 +22,7 @@ from pipelines.formats.logs.trajectories import (
 )
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.records import AngleSample, Message, PoseSample, Sample, Topic
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 
 S = 1_000_000_000
@@ -168,11 +168,11 @@ def test_each_value_of_a_static_transform_holds_from_its_publication_on(
 def test_frames_that_cannot_be_chained_are_refused() -> None:
     late = [replace(s, stamp_ns=s.stamp_ns + 1000 * S) for s in flown(frames=("base", "camera"))]
     transforms = transforms_of([*flown(), *late], "d1.mcap")
-    with refuses("d1.mcap", "'bace'", "base", "`parent`", "`child`"):
+    with refused("data", "d1.mcap", "'bace'", "base", "`parent`", "`child`"):
         chained(transforms, "d1.mcap", parent="odom", child="bace", stamps="header", max_gap_ns=S)
-    with refuses("d1.mcap", "'odom'", "'camera'", "--max-pose-gap"):
+    with refused("data", "d1.mcap", "'odom'", "'camera'", "--max-pose-gap"):
         chained(transforms, "d1.mcap", parent="odom", child="camera", stamps="header", max_gap_ns=S)
-    with refuses("d1.mcap", "topic", "transforms"):
+    with refused("data", "d1.mcap", "topic", "transforms"):
         transforms_of([AngleSample(1, 1, (0, 0, 0), None)], "d1.mcap")
 
 

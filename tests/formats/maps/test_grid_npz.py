@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.formats.maps import voxel_grids
 from pipelines.session import maps
 from pipelines.session.registries import MapFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 
 READER: MapFormat = voxel_grids.NPZ
 
@@ -43,7 +43,7 @@ def test_a_map_of_a_session_can_be_given_to_another_flight(tmp_path: Path) -> No
 def test_its_resolution_is_its_own(tmp_path: Path) -> None:
     path = write(tmp_path / "site.npz")
     assert READER.read_map(path, resolution_m=0.5).resolution_m == 0.5
-    with refuses(path, 0.5, 0.2):
+    with refused("data", path, 0.5, 0.2):
         READER.read_map(path, resolution_m=0.2)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipelines.formats.maps import ros_map
 from pipelines.session.registries import MapFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 
 READER: MapFormat = ros_map.FORMAT
@@ -112,7 +112,7 @@ def test_a_picture_outside_of_the_folder_is_named_in_full_or_not_at_all(tmp_path
     (tmp_path / "outside.pgm").write_bytes(pgm(PICTURE))
     path = write(tmp_path / "plan", image="../outside.pgm", name="plan.pgm")
     (tmp_path / "plan" / "plan.pgm").unlink()
-    with refuses(path, "../outside.pgm"):
+    with refused("no-such-file", path, "../outside.pgm"):
         READER.read_map(path)
     path.write_text(path.read_text(encoding="utf-8").replace("../outside.pgm", f"{tmp_path}/outside.pgm"))
     assert ros_map.FORMAT.pictures(path) == [tmp_path / "outside.pgm"]

@@ -16,7 +16,6 @@ from pipelines.session.recognition import recognise
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import Export, JointFormat
 from tests.formats.motions import motions
-from tests.formats.refusals import refuses
 from tests.raising import refused
 
 READER: JointFormat = joint_files.JOINTS_CSV
@@ -100,7 +99,7 @@ def test_export_writes_skeleton_and_cameras(tmp_path: Path) -> None:
     np.testing.assert_array_equal(
         trajectory_files.POSE_CSV.read_trajectory(paths[1]).position, poses.position
     )
-    with refuses("walk", "reconstruct"):
+    with refused("data", "walk", "reconstruct"):
         WRITER.write(Recording("walk", None, {}), tmp_path)
 
 

@@ -18,7 +18,7 @@ from pipelines.geometry.arrays import Picture
 from pipelines.session.recognition import recognise
 from pipelines.session.records import UNTIMED
 from pipelines.session.registries import VideoFormat
-from tests.formats.refusals import refuses
+from tests.raising import refused
 from tests.real_data import real_data
 from tests.synthetic.videos import (
     SIZE,
@@ -332,7 +332,7 @@ def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
     unit = one + bytes(12) + one + bytes(12)  # of the track, after that of the movie
     at = content.index(unit, content.index(unit) + 1)
     path.write_bytes(content[:at] + (-(1 << 16)).to_bytes(4, signed=True) + content[at + 4 :])
-    with refuses(path):
+    with refused("unsupported", path):
         index_video(path)
 
 
