@@ -6,7 +6,7 @@ Quaternions are xyzw and unit; NaN in gives NaN out. A pose `target_from_source`
 
 import difflib
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -305,8 +305,6 @@ def _slerp(start: Float, end: Float, fraction: Float) -> Float:
 
 # --- covariances ---------------------------------------------------------------------------------------
 
-# Intermediate arrays stay small for any length of log with this many poses at a time.
-_BLOCK = 4096
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -325,15 +323,11 @@ def carried_covariance(
         rotation_xyzw: [..., 4] rotation of the axes of rotation vectors.
         scale: factor on positions.
     """
-
-    def turned(covariance: Float, position_xyzw: Float, rotation_xyzw: Float) -> Float:
-        turns = (matrix_from_quaternion(each) for each in (position_xyzw, rotation_xyzw))
-        of_position, of_rotation = np.broadcast_arrays(*turns)
-        jacobian = _block_diagonal(of_rotation)
-        jacobian[..., :3, :3] = scale * of_position
-        return _propagated(jacobian, covariance)
-
-    return _by_blocks(turned, covariance, position_xyzw, rotation_xyzw)
+    turns = (matrix_from_quaternion(each) for each in (position_xyzw, rotation_xyzw))
+    of_position, of_rotation = np.broadcast_arrays(*turns)
+    jacobian = _block_diagonal(of_rotation)
+    jacobian[..., :3, :3] = scale * of_position
+    return _propagated(jacobian, covariance)
 
 
 def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> Float:
@@ -363,29 +357,11 @@ def mounted_covariance(
     Returns:
         [..., 6, 6] the camera's position in world, rotation vector in the camera.
     """
-
-    def mounted(
-        covariance: Float, world_from_body_xyzw: Float, lever_arm: Float, world_from_camera_xyzw: Float
-    ) -> Float:
-        world_from_body = matrix_from_quaternion(world_from_body_xyzw)
-        camera_from_world = np.swapaxes(matrix_from_quaternion(world_from_camera_xyzw), -1, -2)
-        jacobian = _block_diagonal(camera_from_world @ world_from_body)
-        jacobian[..., :3, 3:] = -cross_matrix(rotate(world_from_body_xyzw, lever_arm)) @ world_from_body
-        return _propagated(jacobian, covariance)
-
-    return _by_blocks(mounted, covariance, world_from_body_xyzw, lever_arm, world_from_camera_xyzw)
-
-
-def _by_blocks(carry: Callable[..., Float], covariance: Float, *vectors: Float) -> Float:
-    """Apply `carry` to covariances and vectors block by block; a vector may be one for all poses."""
-    if covariance.ndim != 3 or len(covariance) <= _BLOCK:
-        return carry(covariance, *vectors)
-    of_each = [np.broadcast_to(vector, (len(covariance), np.shape(vector)[-1])) for vector in vectors]
-    carried = np.zeros(covariance.shape)
-    for start in range(0, len(covariance), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        carried[block] = carry(covariance[block], *(vector[block] for vector in of_each))
-    return carried
+    world_from_body = matrix_from_quaternion(world_from_body_xyzw)
+    camera_from_world = np.swapaxes(matrix_from_quaternion(world_from_camera_xyzw), -1, -2)
+    jacobian = _block_diagonal(camera_from_world @ world_from_body)
+    jacobian[..., :3, 3:] = -cross_matrix(rotate(world_from_body_xyzw, lever_arm)) @ world_from_body
+    return _propagated(jacobian, covariance)
 
 
 def _block_diagonal(rotation: Float) -> Float:

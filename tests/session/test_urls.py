@@ -1,13 +1,7 @@
-"""Sources and sessions that are named by URL; the S3 server runs on the loopback."""
+"""Sources and sessions that are named by URL."""
 
 from __future__ import annotations
 
-import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
@@ -18,48 +12,7 @@ from tests.commands.runner import content, mocap, refused, succeeds
 from tests.raising import refused as refusing
 from tests.synthetic.flights import write_flight
 
-SERVER = str(Path(sys.executable).with_name("moto_server"))
 KEY, SECRET = "AKIAEXAMPLEOFAKEY", "a-secret-that-nobody-may-print"
-
-
-class Server:
-    """An S3 server in a process of its own."""
-
-    def __init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port: int = free.getsockname()[1]
-        self.address = f"http://127.0.0.1:{self.port}"
-        self._process = subprocess.Popen(
-            [SERVER, "-H", "127.0.0.1", "-p", str(self.port)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-
-    def wait(self) -> None:
-        until_s = time.monotonic() + 60
-        while time.monotonic() < until_s:
-            try:
-                socket.create_connection(("127.0.0.1", self.port), 1).close()
-            except OSError:
-                time.sleep(0.05)
-            else:
-                return
-        raise TimeoutError(self.port)
-
-    def close(self) -> None:
-        self._process.kill()
-        self._process.wait()
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    started = Server()
-    try:
-        started.wait()
-        yield started
-    finally:
-        started.close()
 
 
 @pytest.fixture
@@ -75,27 +28,6 @@ def store(tmp_path: Path, cache: Path) -> str:
     return f"file://{tmp_path}/store"
 
 
-@pytest.fixture
-def bucket(server: Server, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Make an empty bucket; return its URL."""
-    for name, value in {
-        "AWS_ACCESS_KEY_ID": KEY,
-        "AWS_SECRET_ACCESS_KEY": SECRET,
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_ENDPOINT_URL": server.address,
-    }.items():
-        monkeypatch.setenv(name, value)
-    name = tmp_path.name.replace("_", "-")[:60].strip("-")
-    connection = HTTPConnection("127.0.0.1", server.port)
-    connection.request("PUT", f"/{name}")
-    assert connection.getresponse().status == 200
-    connection.close()
-    yield f"s3://{name}"
-    from s3fs import S3FileSystem
-
-    S3FileSystem.clear_instance_cache()  # of the clients of this endpoint
-
-
 def written(folder: Path, **files: str) -> None:
     """Write a session of these files."""
     for name, text in {"session.json": "{}", **files}.items():
@@ -108,12 +40,12 @@ def texts(folder: Path) -> dict[str, str]:
 
 
 def test_a_flight_in_a_store_makes_the_same_tables_as_on_disk(
-    bucket: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flight = write_flight(tmp_path / "flight", seconds=0.4)
     for path in sorted((tmp_path / "flight").iterdir()):
-        put(f"{bucket}/flights/{path.name}", path.read_bytes())
-    there, manifest = f"{bucket}/there.session", f"{bucket}/flights/flight.yaml"
+        put(f"{store}/flights/{path.name}", path.read_bytes())
+    there, manifest = f"{store}/there.session", f"{store}/flights/flight.yaml"
     succeeds("ingest", flight.manifest, "-o", tmp_path / "here.session")
     succeeds("ingest", manifest, "-o", there)
     succeeds("ingest", manifest, "-o", tmp_path / "both.session")
