@@ -361,7 +361,11 @@ def _described(
     elif isinstance(format_, CalibrationFormat):
         yield from _of_calibration(path, place, format_)
     elif isinstance(format_, JointFormat):
-        span = _span(format_.read_joints(path, unit=None, axes=None).t_ns)
+        motion = format_.read_joints(path, unit=None, axes=None)
+        if not motion.timed:
+            remedy = "name it under truth: {file: ..., fps: 30, offset_s: SECONDS}"
+            raise DataError(path, "states no times", remedy, code="clock-unknown")
+        span = _span(motion.t_ns)
         yield Proposal("joints", *head, title, file, labels, (0, place), span, type=format_.name)
     elif isinstance(format_, LogFormat):
         yield _recording(path, place, format_)

@@ -579,6 +579,8 @@ class TruthSource(OwnAxes, UprightSource, MeasuredSource, DelayedSource, FileSou
     needs_file = False
     subject: str | None = None
     """Name of the person before the joints' names, in a file of several."""
+    fps: float | None = Field(None, gt=0, le=100_000)
+    """Frames a second of a file of joints without times; `offset_s` is then the time of frame 0."""
     poses: dict[str, str] = {}
     """Files of true poses by camera."""
 

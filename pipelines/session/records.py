@@ -91,6 +91,7 @@ class JointMotion:
     views: Int64 | None = None  # [T, P, J] cameras that measured the joint
     covariance: Float | None = None  # [T, P, J, 6] m^2: xx, xy, xz, yy, yz, zz
     dropped: dict[str, int] = field(default_factory=dict)  # positions in the file that are left out, by cause
+    timed: bool = True  # False: the file states no times, and `t_ns` counts its frames as seconds
 
 
 @dataclass(frozen=True)

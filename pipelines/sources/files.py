@@ -178,7 +178,7 @@ class FlightFiles:
         as_written = own_axes or self._flight.world.up not in {None, "z"}
         axes = "z-up" if as_written else None
         motion = reader.read_joints(path, unit=source.unit, axes=axes)
-        motion = _without_zeros(_of_subject(path, motion, source.subject))
+        motion = _without_zeros(_of_subject(path, _timed(path, motion, source), source.subject))
         if source.unit is None:
             self._refuse_wrong_unit(path, motion, reader, source, axes)
         if source.axes == "ned":
@@ -210,6 +210,18 @@ class FlightFiles:
                     f"holds people of {size_m:.1f} m by its unit, and of {other_m:.2g} m if it is {unit}"
                 )
                 raise DataError(path, problem, f"say truth: {{unit: {unit}}}", code="unit-unknown")
+
+
+def _timed(path: Path, motion: JointMotion, source: TruthSource) -> JointMotion:
+    """Turn numbers of frames into times where a file of joints has none."""
+    if motion.timed and source.fps is None:
+        return motion
+    if motion.timed:
+        raise DataError(path, "states times of its own", "leave truth.fps out", code="wrong-option")
+    if source.fps is None:
+        remedy = "say truth: {fps: 30, offset_s: SECONDS}, the frames a second and the time of frame 0"
+        raise DataError(path, "states no times", remedy, code="clock-unknown")
+    return replace(motion, t_ns=np.rint(motion.t_ns / source.fps).astype(np.int64), timed=True)
 
 
 def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMotion:

@@ -257,6 +257,33 @@ def test_truth_of_zeros_is_missing_and_counted(tmp_path: Path) -> None:
     assert truth.missing == sum(truth.dropped.values()) == len(joints.loc[::7])
 
 
+@pytest.mark.parametrize("number", ["sync_index", None])
+def test_truth_without_times_counts_frames(tmp_path: Path, number: str | None) -> None:
+    """The second frame is left out by caliscope's numbers, and is blank without any."""
+    flight = write_flight(tmp_path, cameras=2, seconds=0.2, clean=True)
+    right = tables(flight)["truth.parquet"]
+    joints = list(dict.fromkeys(right["joint"]))
+    wide = right[["x", "y", "z"]].to_numpy().reshape(-1, 3 * len(joints))
+    table = pd.DataFrame(wide, columns=[f"{joint}_{axis}" for joint in joints for axis in "xyz"])
+    if number:
+        table.insert(0, number, range(len(table)))
+        table = table.drop(index=1)
+    else:
+        table.loc[1] = np.nan
+    table.to_csv(tmp_path / "xyz.csv", index=False)
+    flight.settings["truth"] = {"file": "xyz.csv", "poses": flight.settings["truth"]["poses"]}
+    flight.save()
+    with refused("clock-unknown", tmp_path / "xyz.csv", "fps"):
+        ingest(flight.manifest)
+    flight.settings["truth"] |= {"fps": 30, "offset_s": START_NS // 10**9}
+    flight.save()
+    found = tables(flight)["truth.parquet"]
+    kept = right[right["t_ns"] != np.unique(right["t_ns"])[1]].reset_index(drop=True)
+    found = found[np.isfinite(found["x"])].reset_index(drop=True)
+    assert np.abs(found["t_ns"] - kept["t_ns"]).max() <= 1
+    pd.testing.assert_frame_equal(found.drop(columns="t_ns"), kept.drop(columns="t_ns"))
+
+
 @pytest.mark.parametrize("up", ["y", "-x"])
 def test_the_axis_of_the_truth_is_stated_for_itself(tmp_path: Path, up: Any) -> None:
     """Joints of a file that is y up, in feet, beside poses that are z up."""

@@ -16,6 +16,7 @@ from pipelines.formats.common.exporting import note_no_skeleton, safe_file_name,
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.refusals import damaged
 from pipelines.formats.common.rows import (
+    SECONDS,
     Heading,
     TextTable,
     bounding_box,
@@ -243,12 +244,15 @@ _MOST_CELLS_PER_ROW = 100
 
 # Tables of devices have one or two points of such columns.
 LEAST_JOINTS_OF_WIDE = 4
+# The column of frame numbers of caliscope, and of other programs.
+_FRAME_NAMES = ("sync_index", "frame")
 
 
 class JointsCsvFormat:
     """Reader of the header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
 
-    Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope).
+    Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope);
+    without a time their frames are counted.
     Metres and z up unless the user states otherwise. Rows of single joints may come in any order; people are
     ranked by their number. A position that is blank, infinite or absent is missing (NaN).
     """
@@ -308,19 +312,21 @@ def _joints_of_wide(text: str) -> dict[str, int]:
 
 
 def _read_wide(path: Path, text: str, columns: dict[str, int], unit: str, axes: str) -> JointMotion:
-    heading = find_heading(text.split("\n", 1)[0], delimiters=",")
-    if heading is None:
-        problem, remedy = "states no times", "give the .trc that caliscope writes beside it, or add `time`"
-        raise DataError(path, problem, remedy, code="clock-unknown")
+    first = text.split("\n", 1)[0]
     numbers = {f"{joint} {k}": column + k for joint, column in columns.items() for k in range(3)}
+    timed = find_heading(first, delimiters=",")
+    cells = [cell_name(cell)[0] for cell in first.split(",")]
+    numbered = next((cells.index(name) for name in _FRAME_NAMES if name in cells), None)
+    heading = timed or Heading(0, ",", len(cells), numbered or 0, SECONDS, {})
     table = rows_below(path, heading, text, {}, numbers)
-    stamps = _stamps(path, heading, table)
+    if timed or numbered is not None:
+        stamps = _stamps(path, heading, table)
+    else:
+        stamps = np.arange(len(table.text["stamp"])) * 10**9
     if (np.diff(stamps) <= 0).any():
         raise DataError(path, "its times do not increase", "sort its rows", code="bad-value")
-    position = table.stack([*numbers]).reshape(len(stamps), len(columns), 3)
-    return JointMotion(
-        stamps, joint_names(tuple(columns)), to_metres_z_up(path, position, unit, axes)[:, None]
-    )
+    position = to_metres_z_up(path, table.stack([*numbers]).reshape(len(stamps), len(columns), 3), unit, axes)
+    return JointMotion(stamps, joint_names(tuple(columns)), position[:, None], timed=timed is not None)
 
 
 def _find_heading(text: str) -> Heading | None:

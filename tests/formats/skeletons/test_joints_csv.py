@@ -115,8 +115,9 @@ def test_a_row_for_each_time_as_freemocap_writes_them(tmp_path: Path) -> None:
     assert motion.t_ns.tolist() == [0, 10**9]
     np.testing.assert_allclose(motion.position[1, 0, 1], [0.301, 0.401, 0.501])
     path.write_text("\n".join([f"sync_index,{head}", *(row.partition(",")[2] for row in rows)]) + "\n")
-    with refused("clock-unknown", path):
-        reader.read_joints(path, unit=None, axes=None)
+    frames = reader.read_joints(path, unit="mm", axes=None)
+    assert (frames.t_ns.tolist(), frames.timed) == ([0, 10**9], False)
+    np.testing.assert_array_equal(frames.position, motion.position)
     np.save(tmp_path / "skeleton_3d.npy", np.zeros((4, 33, 3)))
     with refused("wrong-kind", tmp_path / "skeleton_3d.npy", "NumPy"):
         recognise(tmp_path / "skeleton_3d.npy", JointFormat, "joint file")
