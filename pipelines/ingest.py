@@ -17,8 +17,9 @@ import numpy as np
 from pipelines.drafting.found import GIMBAL, is_called
 from pipelines.formats.common.files import leads_out
 from pipelines.formats.logs.messages import kind_of
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Intrinsics
 from pipelines.reconstruction.doubts.logs import doubts_of_logs, doubts_of_places
+from pipelines.reconstruction.picture_map import PictureMap
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.description import (
     ActorEntry,
@@ -40,8 +41,8 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import recognise
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
 from pipelines.session.registries import MapFormat
-from pipelines.session.stages import Run, Stage, StageRecord, locked, note_sources
-from pipelines.session.storage import read_json, write_json
+from pipelines.session.stages import Run, Stage, StageRecord, locked, note_sources, usable_record
+from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
@@ -56,6 +57,9 @@ from pipelines.session.tables import (
     write_table,
 )
 from pipelines.session.urls import as_urls, located, media_path, named
+from pipelines.sources.attitudes import FilmOfCamera, TurnedByPictures, turned_by_pictures
+from pipelines.sources.attitudes import load_map as load_picture_map
+from pipelines.sources.attitudes import store_map as store_picture_map
 from pipelines.sources.cameras import FlightCameras
 from pipelines.sources.files import FlightFiles, fetch_sources, hash_sources, refuse_written, source_stamps
 from pipelines.sources.keypoints import (
@@ -70,12 +74,14 @@ from pipelines.sources.keypoints import (
 from pipelines.sources.logs import FlightLogs, maps_of_log
 from pipelines.sources.parts import (
     CameraData,
+    CameraFrames,
     camera_entry,
     refuse_no_overlap,
     span_of_pictures,
     span_words,
     store_camera,
 )
+from pipelines.sources.pictures import open_files
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
@@ -135,6 +141,7 @@ def ingest(
         stamps = source_stamps(flight, flight_path.parent)
         check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
         sources = hash_sources(flight, flight_path.parent, progress)
+        reader.hashes, reader.progress, reader.force = sources, progress, force
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
@@ -206,6 +213,9 @@ class _FlightReader:
         self._files = FlightFiles(flight, flight_path)
         self._poses = FlightPoses(flight, flight_path, self._logs, self._files, max_gap_ns=gap_ns, note=note)
         self._cameras = FlightCameras(flight_path, self._logs, self._files, self._poses.triggers, note)
+        self.hashes: Mapping[str, str] = {}  # SHA-256 of the sources by their names in the manifest
+        self.progress: Progress = Silent()
+        self.force = False  # maps of pictures of an earlier ingest are not used
         self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 
     def __enter__(self) -> Self:
@@ -234,8 +244,8 @@ class _FlightReader:
         """Write the tables of one camera, its entry and its warnings."""
         camera = self._flight.cameras[name]
         logged = self._files.is_log("pose", camera.pose)
-        data = self._read_camera(name)
         (folder / "tables").mkdir()
+        data = self._read_camera(name, folder / "tables")
         store_camera(data, folder / "tables")
         entry = camera_entry(
             name,
@@ -264,8 +274,11 @@ class _FlightReader:
             return "ned"
         return gimbal.axes or self._logs.settings(gimbal.file).axes or self._flight.world.frame
 
-    def _read_camera(self, name: str) -> CameraData:
-        """Read everything about one camera, and check the parts against each other."""
+    def _read_camera(self, name: str, folder: Path) -> CameraData:
+        """Read everything about one camera, and check the parts against each other.
+
+        A map of its pictures is stored in the folder.
+        """
         camera = self._flight.cameras[name]
         video = self._files.video(camera)
         detections, detector_format = None, ""
@@ -280,8 +293,15 @@ class _FlightReader:
             detections = near_picture(detections, intrinsics)
         frames = self._cameras.frames(name, camera, video, detections)
         trajectory = self._poses.trajectory(name, camera, frames)
-        if camera.pose_noise:
-            noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)
+        pose_noise = camera.pose_noise
+        if pose_noise:
+            noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", pose_noise)
+        picture_map = None
+        if camera.pose.by_pictures:
+            turned = self._turned_by_pictures(name, camera, frames, intrinsics, trajectory)
+            trajectory, intrinsics, pose_noise = turned.trajectory, turned.intrinsics, turned.pose_noise
+            picture_map = turned.entry
+            store_picture_map(turned.map, folder)
         if detections is not None:
             numbers = doubt_numbers(detections, frames, from_video=video is not None)
             if camera.keypoints and "first_frame" not in camera.keypoints.model_fields_set and numbers:
@@ -304,6 +324,52 @@ class _FlightReader:
             log_clock=self._poses.log_clock(camera),
             still=self._poses.is_still(camera),
             notes=self.take_notes(),
+            pose_noise=pose_noise,
+            picture_map=picture_map,
+        )
+
+    def _turned_by_pictures(
+        self,
+        name: str,
+        camera: CameraSources,
+        frames: CameraFrames,
+        intrinsics: Intrinsics,
+        places: Trajectory,
+    ) -> TurnedByPictures:
+        """Find the attitudes of a camera by its film, from the map of an earlier ingest if it has one."""
+        video = camera.video
+        if video is None:
+            raise AssertionError("the manifest refuses it")
+        paths = self._flight.paths_of(video.file)
+        files = [located(self._flight_path.parent, path) for path in paths]
+        stamps = self._logs.settings(video.file).stamps if frames.topic else "header"
+
+        def kept(key: str) -> PictureMap | None:
+            before = usable_record(self._session / INGEST.name / "stage.json")
+            stored = f"cameras/{name}/picture_map.parquet"
+            path = self._session / stored
+            digest = sha256_of(path) if path.is_file() else None
+            if self.force or before is None or digest is None or before.outputs.get(stored) != digest:
+                return None
+            entry = read_description(self._session).cameras[name].picture_map
+            return load_picture_map(path.parent, entry) if entry and entry.key == key else None
+
+        return turned_by_pictures(
+            f"{self._flight_path}: cameras.{name}",
+            name,
+            FilmOfCamera(
+                hash_of([[self.hashes[path] for path in paths], frames.topic, stamps]),
+                partial(open_files, files, frames.topic, stamps),
+            ),
+            frames,
+            intrinsics,
+            places,
+            refine_focal=camera.intrinsics.assumed,
+            pose_noise=camera.pose_noise,
+            satellite_sigma_m=self._poses.satellite_sigma_m(camera),
+            kept=kept,
+            note=self._take_note,
+            progress=self.progress,
         )
 
     def origin(self) -> OriginEntry | None:

@@ -30,7 +30,7 @@ from pipelines.drafting.found import (
     VideoStart,
 )
 from pipelines.drafting.matching import CameraDraft, Chosen, FlightDraft
-from pipelines.session.manifest import SCHEMA, CameraSources, Manifest
+from pipelines.session.manifest import PICTURES, SCHEMA, CameraSources, Manifest
 from pipelines.session.yaml_models import YamlModel
 
 # Most cameras of drones film at 30 pictures a second unless asked otherwise.
@@ -282,12 +282,16 @@ class _ManifestWriter:
                 kind = "above the take-off" if other == "absolute" else "absolute, from a barometer"
                 what = f"heights {kind} (altitude: {other} takes the other)"
                 remarks.append(self.assume(camera, "pose", what))
-            if taken.step_ns > BRIDGED_NS:
+            if taken.step_ns > BRIDGED_NS and not _is_turned_by_film(camera):
                 step_s = taken.step_ns / 1e9
                 gap = f"ingest with --max-pose-gap {1.5 * step_s:.3g}"
                 remarks.append(f"a position every {step_s:.3g} s: {gap}")
         elif taken.kind == "pose" and not taken.topic and "parent" not in taken.settings:
             remarks.append("if of the body, not the camera: add of: body, and a mount")
+        if _is_turned_by_film(camera):
+            remarks.append("no attitudes: the film says how the camera turned")
+            turned = {**taken.settings, "attitude": PICTURES}
+            return self.entry("pose", [taken, *choice.others], remarks, turned)
         if taken.ned_hint:
             what = (
                 f"axes enu, although {flow(taken.ned_hint)} sounds like north-east-down: else add axes: ned"
@@ -301,6 +305,9 @@ class _ManifestWriter:
         if choice is None or choice.taken.kind == "still":
             return {}
         taken = choice.taken
+        if _is_turned_by_film(camera):
+            why = "in place of attitude: pictures, if the camera never turned"
+            return {"gimbal": DraftedKey(None, [why], example={"yaw_deg": 90, "pitch_deg": -30})}
         example = {"looks": "forward", "translation": [0, 0, 0]}
         lever = DraftedKey(None, ["the lever arm to the gimbal, m"], example=example)
         if not (taken.of_body or taken.unturned):
@@ -439,6 +446,13 @@ class _ManifestWriter:
                 about += "; if known to be true: truth: FILE"
             lines.append(f"#   {flow(self._relative(found.path))}  ({one_line(about)})")
         return lines
+
+
+def _is_turned_by_film(camera: CameraDraft) -> bool:
+    """Test if nothing but its film says how a camera turned."""
+    choice = camera.choices.get("pose")
+    filmed = camera.film is not None and "gimbal" not in camera.choices
+    return choice is not None and choice.taken.unturned and filmed
 
 
 def _settings(candidate: Proposal) -> dict[str, object]:

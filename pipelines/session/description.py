@@ -163,6 +163,20 @@ class OriginEntry(Entry):
     source: str  # "world.origin", or the log whose first position is the origin
 
 
+class PictureMapEntry(Entry):
+    """The map of key pictures from which a camera's attitudes were found."""
+
+    key: str  # hash of pictures, lens and settings, by which the map is kept
+    key_pictures: int
+    mapped: int  # of them
+    points: int
+    error_px: float  # mean reprojection error
+    residual_m: float  # root mean square distance of the logged places from the map
+    common_sigma_deg: float  # per axis, of the error that all attitudes share
+    picture_sigma_deg: float  # per axis, of the error of each picture
+    focal_ratio: float = 1.0  # refined focal length over the stated one
+
+
 class CameraEntry(Entry):
     """One camera."""
 
@@ -174,6 +188,7 @@ class CameraEntry(Entry):
     log_clock: LogClockEntry | None = None
     pose_noise: dict[str, dict[str, float | str]] | None
     media: MediaEntry | None
+    picture_map: PictureMapEntry | None = None  # where `pose.attitude: pictures` is stated
 
 
 # These are the heights of the hips above the logged point of a standing person of 1.75 m.

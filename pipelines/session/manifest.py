@@ -41,6 +41,9 @@ SCHEMA = 1
 # A year at 30 Hz has fewer frames: a larger number was misread.
 _MAX_FRAME_NUMBER = 10**9
 
+PICTURES = "pictures"
+"""Value of `pose.attitude` for attitudes that are found by the camera's film."""
+
 Axes = Literal["enu", "ned"]
 Up = Literal["z", "-z", "y", "-y", "x", "-x"]
 Unit = Literal["m", "cm", "mm", "ft"]
@@ -99,21 +102,12 @@ class LoggedPose(FiledPose, FramedSource):
 
     child: str | None = None
     """Frame of the camera or body, for poses that are chained from transforms."""
-    attitude: str | None = None
-    """Topic of attitudes, for a topic that has only positions."""
 
     @model_validator(mode="after")
     def _complete(self) -> LoggedPose:
         if (self.parent is None) != (self.child is None):
             raise ValueError("needs both parent and child, or neither")
-        if self.attitude and self.parent:
-            raise ValueError("has attitude beside frames: leave one of them out")
         return self
-
-    @property
-    def joins_topics(self) -> bool:
-        """True if position and attitude come from separate topics."""
-        return self.attitude is not None
 
 
 class LoggedAngles(YamlModel):
@@ -406,6 +400,13 @@ class PoseSource(PlacedSource, MeasuredSource, FileSource):
     part = "pose"
     of: Literal["camera", "body"] | None = None
     """Object of the poses: the camera, or the body that carries it by a mount or gimbal."""
+    attitude: str | None = None
+    """Topic of attitudes, for a topic of positions; or `pictures`: the camera's film shows how it turned."""
+
+    @property
+    def by_pictures(self) -> bool:
+        """True if the attitudes are found by the camera's film."""
+        return self.attitude == PICTURES
 
 
 class Mount(Guess, RigidTransform):
@@ -546,6 +547,10 @@ class CameraSources(YamlModel):
             raise ValueError("pose is of the body: say how the camera sits on it with `mount` or `gimbal`")
         if self.pose.of == "camera" and self.is_carried:
             raise ValueError("a mount or gimbal needs the pose of the body: add `of: body` to `pose`")
+        if self.pose.by_pictures and self.is_carried:
+            raise ValueError("pose.attitude: pictures gives the camera's own: leave mount and gimbal out")
+        if self.pose.by_pictures and self.video is None:
+            raise ValueError("pose.attitude: pictures needs a video")
         return self
 
     @property

@@ -145,9 +145,8 @@ _UNREAD = (
      "Acclaim motion (ASF/AMC)", "convert it to BVH or C3D"),
     (re.compile(rb"(?:\xef\xbb\xbf)?\[Script Info\]"), "subtitles as ASS, which Autel's drones write",
      "write their positions as a CSV of poses"),
-    (re.compile(rb"(?s).{,400}<kml\b|.{,400}<gpx\b|.{,400}<TrainingCenterDatabase\b|.{8}\.FIT"),
-     "a track of a watch or a map program (GPX, KML, TCX or FIT)",
-     "write latitude, longitude and altitude as sensor_msgs/NavSatFix into a log"),
+    (re.compile(rb"(?s).{,400}<kml\b|.{,400}<TrainingCenterDatabase\b|.{8}\.FIT"),
+     "a track of a watch or a map program (KML, TCX or FIT)", "export it as GPX"),
     (re.compile(rb"\$G[A-Z]{4},"), "a receiver's log (NMEA)",
      "write its places as sensor_msgs/NavSatFix into a log"),
     (re.compile(rb"# Camera list|# Image list|# 3D point list"), "one file of a COLMAP model",
@@ -276,7 +275,7 @@ def _of_table(cells: list[str]) -> Likeness:
     names = {cell.lower() for cell in cells}
     if names & {"latitude", "lat"} and names & {"longitude", "lon", "lng", "long"}:
         turned = any(angle in name for name in names for angle in ("yaw", "heading", "pitch"))
-        remedy = _AS_RECORD if turned else "poses need attitudes, too: give the drone's own log"
+        remedy = _AS_RECORD if turned else "places need a time and an altitude, too"
         return Likeness(f"is a table of places on Earth whose writer is not known, with {columns}", remedy)
     if {"roll", "pitch", "yaw"} <= names:
         remedy = "convert them to quaternions qx, qy, qz, qw: their order and axes are not stated"

@@ -20,6 +20,7 @@ from pipelines.session.description import (
     LogClockEntry,
     MediaEntry,
     MountEntry,
+    PictureMapEntry,
     PlaceEntry,
     PosesEntry,
 )
@@ -70,6 +71,8 @@ class CameraData:
     log_clock: ClockFit | None
     still: bool  # it stands still, with one pose
     notes: list[str]
+    pose_noise: dict[str, dict[str, float | str]] | None
+    picture_map: PictureMapEntry | None = None
 
 
 def store_camera(data: CameraData, folder: Path) -> None:
@@ -115,8 +118,9 @@ def camera_entry(
             start=_clock_start(camera, frames),
         ),
         log_clock=LogClockEntry(**asdict(data.log_clock)) if data.log_clock else None,
-        pose_noise=camera.pose_noise,
+        pose_noise=data.pose_noise,
         media=data.media,
+        picture_map=data.picture_map,
     )
     for part, dropped in (
         ("frames", entry.frames.dropped),

@@ -43,16 +43,16 @@ def open_pictures(session: Path, description: Description, camera: str) -> Itera
     media = _media(description, camera)
     refuse_changed_pictures(session, description, [camera])
     paths = [located(session, path) for path in media.paths]
-    opened: CameraPictures = (
-        _filed(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
-    )
-    with opened as pictures:
+    with open_files(paths, media.topic, media.stamps) as pictures:
         yield pictures
     refuse_changed_pictures(session, description, [camera])
 
 
-def _filed(path: Path) -> VideoReader | FolderPictures:
-    return FolderPictures(path) if path.is_dir() else VideoReader(path)
+def open_files(paths: list[Path], topic: str | None, stamps: str) -> CameraPictures:
+    """Open a video, a folder of pictures, or the pictures in a topic of a log."""
+    if topic is not None:
+        return LoggedPictures(paths, topic, stamps)
+    return FolderPictures(paths[0]) if paths[0].is_dir() else VideoReader(paths[0])
 
 
 def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:

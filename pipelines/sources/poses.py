@@ -84,9 +84,13 @@ _FIXED = "fixed angles"
 # Datums of one continent, as ETRS89 and WGS84, differ by less.
 SAME_PLACE_M = 1.0
 
+# Receivers without corrections are off by this (docs/flight.md, Poses).
+USUAL_SATELLITE_SIGMA_M = 1.5
+
 _ABOVE_TAKE_OFF = ("take-off", "stated")
-_ADD_ANGLES = (
-    "add gimbal: {file, topic, relative_to: world} with the angles of another log, or"
+ADD_ANGLES = (
+    "add attitude: pictures to pose, and the film says how the camera turned; or"
+    " gimbal: {file, topic, relative_to: world} with the angles of another log, or"
     " gimbal: {yaw_deg: 90, pitch_deg: -30} if the camera never turned"
 )
 _ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, or add a gimbal"
@@ -140,6 +144,8 @@ class FlightPoses:
     def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames) -> Trajectory:
         """Read world_from_camera over time; a static camera has one row, at its first frame.
 
+        With `attitude: pictures` only the positions have a meaning.
+
         Args:
             name: name of the camera.
             camera: its description.
@@ -148,6 +154,8 @@ class FlightPoses:
         DataError: nothing usable, or the manifest does not state the camera's mount on the body.
         """
         pose = camera.pose
+        if pose.by_pictures:
+            return self._places(name, camera)
         if self.is_still(camera):
             source, still = self._stated_poses(name, camera)
             first_ns = int(frames.t_ns[0])
@@ -211,7 +219,7 @@ class FlightPoses:
     def _is_joined(self, pose: PoseSource) -> bool:
         """Return True if position and attitude come separately: a drone's own log, or several topics."""
         if self._is_log(pose):
-            return self._logged(pose).joins_topics
+            return pose.attitude is not None and self._logged(pose).parent is None
         return isinstance(self._files.format_of("pose", pose), TelemetryFormat)
 
     def refuse_unfit(self) -> None:
@@ -227,6 +235,8 @@ class FlightPoses:
     def _unfit_pose(self, camera: CameraSources) -> Iterator[tuple[str, str]]:
         pose, is_log = camera.pose, self._is_log(camera.pose)
         title = self._files.format_of("pose", pose).title
+        if pose.attitude and not is_log and (self.is_still(camera) or not pose.by_pictures):
+            yield f"pose: attitude: no option of this file ({title})", "leave it out"
         if self._files.format_of("pose", pose).name == "airsim" and pose.axes:
             yield f"pose: axes: a file of this kind ({title}) states its own", "leave them out"
         if self.is_still(camera):
@@ -235,13 +245,15 @@ class FlightPoses:
         elif self._is_joined(pose):
             if pose.unit:
                 yield f"pose: unit: a file of this kind ({title}) states its own", "leave it out"
-            if pose.axes and not (is_log and self._logged(pose).attitude):
+            if pose.axes and not is_log:
                 yield f"pose: axes: a file of this kind ({title}) states its own", "leave them out"
         elif camera.is_carried and pose.of != "body" and not is_log:
             yield "a mount or gimbal needs the pose of the body", "add `of: body` to `pose`"
         if is_log:
-            logged = self._logged(pose)
-            if logged.attitude and not pose.topic:
+            framed = self._logged(pose).parent is not None
+            if pose.attitude and framed and not pose.by_pictures:
+                yield "pose: attitude: has no use beside frames", "leave one of them out"
+            if pose.attitude and not (pose.topic or framed):
                 yield "pose: attitude: needs the topic of the positions", "add topic: TOPIC"
 
     def _unfit_gimbal(self, camera: CameraSources) -> Iterator[tuple[str, str]]:
@@ -524,7 +536,7 @@ class FlightPoses:
                 choice = self._files.options("pose", pose, TelemetryChoice)
                 found = reader.read_telemetry(self._one_file(pose.file), choice)
             else:
-                found = self._logged_telemetry(pose, self._logged(pose))
+                found = self._logged_telemetry(pose)
             since_ns = int(found.position.t_ns[0])
 
             def clocked(track: Track) -> Track:
@@ -538,12 +550,13 @@ class FlightPoses:
             )
         return self._telemetry[key]
 
-    def _logged_telemetry(self, pose: PoseSource, options: LoggedPose) -> Telemetry:
-        """Read telemetry from a topic of positions and one of attitudes, at the log's own times."""
+    def _logged_telemetry(self, pose: PoseSource) -> Telemetry:
+        """Read telemetry from a topic of positions, and one of attitudes if named, at the log's own times."""
         with self._logs.open(pose.file) as opened:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
             axes = self._axes(pose.axes, opened.settings.axes)
-            found = read_pair(recording, source, pose.topic or "", options.attitude or "", axes, stamps)
+            attitude = None if pose.by_pictures else pose.attitude
+            found = read_pair(recording, source, pose.topic or "", attitude, axes, stamps)
             if not (pose.axes or opened.settings.axes):
                 found = self._upright_pair(found)
             return replace(found, dropped=dict(Counter(found.dropped) + opened.lost))
@@ -696,6 +709,30 @@ class FlightPoses:
         poses = replace(self._on_body(name, camera, carrier, gimbal), body_xyzw=None)
         return in_world(poses, self._logs.settings(stated).world_from_source)
 
+    def _places(self, name: str, camera: CameraSources) -> Trajectory:
+        """Return the places of a camera whose attitudes are found by its film; rotations have no meaning."""
+        pose = camera.pose
+        if self._is_joined(pose):
+            telemetry = self._read(pose)
+            for note in telemetry.notes:
+                self._note(note)
+            values, _ = self._in_world(name, telemetry.position)
+            level = np.tile(LEVEL, (len(values), 1))
+            logged = Trajectory(telemetry.position.t_ns, values, level, dropped=dict(telemetry.dropped))
+            placed = in_world(logged, self._logs.settings(pose.file).world_from_source)
+        else:
+            placed = self._local(*self._stated_poses(name, camera))
+        return replace(in_world(placed, pose.world_from_source), covariance=None)
+
+    def satellite_sigma_m(self, camera: CameraSources) -> float | None:
+        """Return the standard deviation of a satellite receiver's positions; None for other positions."""
+        if not self._is_joined(camera.pose):
+            return None
+        track = self._read(camera.pose).position
+        if not (track.on_earth or track.origin is not None):
+            return None
+        return USUAL_SATELLITE_SIGMA_M if track.accuracy_m is None else max(track.accuracy_m)
+
     def _gimbal(self, name: str, camera: CameraSources, telemetry: Telemetry) -> AttitudeTrack | None:
         """Return the angles of the drone's own log, unless the body's attitudes are asked for."""
         gimbal, own = camera.gimbal, telemetry.gimbal
@@ -723,7 +760,7 @@ class FlightPoses:
         stated = camera.pose.file
         if telemetry.body is None and gimbal is None:
             problem = f"{stated} says where the drone was but not how it was turned"
-            raise DataError(place, problem, _ADD_ANGLES, code="no-attitude")
+            raise DataError(place, problem, ADD_ANGLES, code="no-attitude")
         if telemetry.body is None and gimbal is not None and gimbal.relative_to != "world":
             problem = (
                 f"its gimbal's angles are relative to the {gimbal.relative_to}, but {stated} does not say how"

@@ -164,14 +164,14 @@ def test_a_video_begins_when_the_telemetry_in_it_says(tmp_path: Path) -> None:
     write_lens(tmp_path)
     result, stated = drafted(tmp_path)
     (camera,) = stated["cameras"].values()
-    assert camera["pose"] == "GOPR1.MP4"
+    assert camera["pose"] == {"file": "GOPR1.MP4", "attitude": "pictures"}
     assert float(camera["frame_times"]["start"]) == pytest.approx(START_NS / 1e9, abs=1e-6)
     assert camera["frame_times"]["assumed"] is True
     assert camera["clock"]["sigma_s"] == 0.2  # a packet of a second has but its own time
-    assert len(result.missing) == 1
-    assert "gimbal: {yaw_deg:" in refused("ingest", result.path)
+    assert not result.missing
+    assert "gimbal: {yaw_deg:" in refused("ingest", result.path)  # its pictures show nothing
     text = result.path.read_text(encoding="utf-8").replace("# gimbal: {yaw_deg", "gimbal: {yaw_deg")
-    result.path.write_text(text, encoding="utf-8")
+    result.path.write_text(text.replace(", attitude: pictures", ""), encoding="utf-8")
     assert frames_with_poses(result.path) == 33
 
 

@@ -46,7 +46,6 @@ SUBTITLE = "1\n00:00:00,000 --> 00:00:01,000\nHello\n"
         ("a.toml", b"[first", "TOML"),
         ("a.yaml", b"%YAML:1.0\nfirst: 1\n", "first"),
         ("a.csv", b"lap,speed,gear\n1,2,3\n", "lap, speed, gear"),
-        ("a.csv", b"lat,lon,alt,time\n48,11,500,0\n", "places on Earth"),
         ("a.mp4", bytes(range(200)), "is called .mp4 but holds nothing of that kind"),
         ("a.dat", b"\x01\x02\x03\x04\0\0", "01 02 03 04"),
         ("a.txt", b"Dear diary\n", "text"),

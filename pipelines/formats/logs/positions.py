@@ -57,26 +57,28 @@ def pairs_of(topics: Sequence[Topic]) -> list[tuple[str, str]]:
 
 
 def read_pair(
-    recording: Log, source: str, position: str, attitude: str, axes: Axes, stamps: Stamps
+    recording: Log, source: str, position: str, attitude: str | None, axes: Axes, stamps: Stamps
 ) -> Telemetry:
     """Read a topic of positions (`FIXES`, PointStamped) and one of attitudes (Imu, QuaternionStamped).
 
     Axes are those of attitudes, and of positions in metres.
     """
     counts = {topic.name: topic.count for topic in recording.topics}
-    for name in (position, attitude):
+    for name in filter(None, (position, attitude)):
         if not counts.get(name):
             raise DataError(source, f"has no topic {name}, or nothing in it", "name another")
     dropped: dict[str, int] = {}
     notes: list[str] = []
     track = read_positions(recording, source, position, stamps, dropped, notes)
+    if axes == "ned" and not track.on_earth:
+        track = replace(track, values=track.values[:, [1, 0, 2]] * [1, 1, -1])
+    if attitude is None:
+        return Telemetry(track, None, None, f"{stamps} stamps", notes=tuple(notes), dropped=dropped)
     rows = _read(recording, source, attitude, _quaternion_of)
     notes += rows.notes(f"{source} {attitude}", stamps)
     turned = rows.values
     if axes == "ned":
         turned = attitude_in_enu(turned, relative_to="world", axes="ned")
-        if not track.on_earth:
-            track = replace(track, values=track.values[:, [1, 0, 2]] * [1, 1, -1])
     body = attitude_track(attitude, rows.times(stamps), turned, dropped)
     return Telemetry(track, body, None, f"{stamps} stamps", notes=tuple(notes), dropped=dropped)
 

@@ -1,0 +1,206 @@
+"""Poses of a camera whose log has places alone: its film says how it turned (`pose.attitude: pictures`)."""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from pipelines.geometry.arrays import Int64, Intrinsics
+from pipelines.geometry.noise import PoseErrors, pose_errors
+from pipelines.reconstruction.picture_map import (
+    REVISION,
+    KeyFeatures,
+    LaidMap,
+    NoAttitudesError,
+    PictureMap,
+    features_of,
+    key_rows,
+    lay_on_places,
+    map_pictures,
+    poses_of_pictures,
+    with_focal,
+)
+from pipelines.session.camera_poses import noise_models
+from pipelines.session.description import PictureMapEntry
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Progress
+from pipelines.session.records import Trajectory
+from pipelines.session.storage import hash_of
+from pipelines.session.tables import read_table, write_table
+from pipelines.sources.parts import CameraFrames
+from pipelines.sources.pictures import CameraPictures
+
+PICTURE_MAP = pa.schema(
+    [("key", pa.int64()), *((name, pa.float64()) for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))]
+)
+"""cameras/<camera>/picture_map.parquet: map_from_camera of the mapped key pictures."""
+
+# A satellite receiver's error decorrelates in minutes (docs/flight.md, Poses).
+SATELLITE_CORRELATION_S = 100.0
+
+# Positions of a log on board that state no errors are taken to have the constant ones of `UNKNOWN_SIGMA`.
+UNSTATED_BIAS_M = 0.3
+
+
+@dataclass(frozen=True)
+class TurnedByPictures:
+    """Poses with attitudes by pictures, and what comes with them."""
+
+    trajectory: Trajectory
+    intrinsics: Intrinsics  # with the focal length of the map, if that was refined
+    pose_noise: dict[str, dict[str, float | str]]  # of places as stated, of attitudes as found
+    map: PictureMap
+    entry: PictureMapEntry
+
+
+@dataclass(frozen=True)
+class FilmOfCamera:
+    """Pictures from which the attitudes are found.
+
+    Attributes:
+        digest: SHA-256 of their files.
+        opened: opens them.
+    """
+
+    digest: str
+    opened: Callable[[], AbstractContextManager[CameraPictures]]
+
+
+def turned_by_pictures(
+    place: str,
+    name: str,
+    film: FilmOfCamera,
+    frames: CameraFrames,
+    intrinsics: Intrinsics,
+    places: Trajectory,
+    *,
+    refine_focal: bool,
+    pose_noise: Mapping[str, Mapping[str, float | str]] | None,
+    satellite_sigma_m: float | None,
+    kept: Callable[[str], PictureMap | None],
+    note: Callable[[str], None],
+    progress: Progress,
+) -> TurnedByPictures:
+    """Find the attitudes of a camera by its film.
+
+    Args:
+        place: the camera in the manifest, for messages.
+        name: name of the camera.
+        film: its pictures.
+        frames: their times.
+        intrinsics: its lens.
+        places: its logged places; the rotations have no meaning.
+        refine_focal: the focal length is a guess, and is refined where the pictures determine it.
+        pose_noise: noise models of the manifest.
+        satellite_sigma_m: standard deviation of satellite positions; None for positions of another kind.
+        kept: returns the map of an earlier ingest by its key, if there is one.
+        note: receives one line on the result.
+        progress: receives the progress over key pictures.
+
+    Raises:
+        DataError: the film and the places do not determine the attitudes.
+    """
+    rows = key_rows(frames.pts_ns)
+    numbers = frames.frame[rows].tolist()
+    key = hash_of([REVISION, film.digest, numbers, asdict(intrinsics), refine_focal])
+    stated = None if not pose_noise else {model: dict(values) for model, values in pose_noise.items()}
+    if stated is None and satellite_sigma_m is not None:
+        stated = {"gauss-markov": {"position_m": satellite_sigma_m, "correlation_s": SATELLITE_CORRELATION_S}}
+        note(f"{name}: its places are taken to be off by {satellite_sigma_m:g} m: say pose_noise if not")
+    try:
+        found = kept(key)
+        if found is None:
+            progress.start(f"Mapping {name} by its pictures", len(numbers))
+            features = _features(film, numbers, intrinsics, progress)
+            found = map_pictures(features, intrinsics, refine_focal=refine_focal)
+        laid = lay_on_places(found, frames.t_ns[rows], places.t_ns, places.position, _errors(place, stated))
+    except NoAttitudesError as error:
+        problem = f"its film does not say how it turned: {error}"
+        remedy = "name a log with attitudes, or gimbal: {yaw_deg: 90, pitch_deg: -30} if it never turned"
+        raise DataError(f"{place}.pose.attitude", problem, remedy, code="no-attitude") from None
+    position, turned = poses_of_pictures(laid, places.t_ns, places.position, frames.t_ns)
+    known = np.isfinite(turned[:, 0])
+    common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
+    entry = PictureMapEntry(
+        key=key,
+        key_pictures=len(numbers),
+        mapped=len(found.key),
+        points=found.points,
+        error_px=found.error_px,
+        residual_m=laid.residual_m,
+        common_sigma_deg=common_deg,
+        picture_sigma_deg=picture_deg,
+        focal_ratio=found.focal_ratio,
+    )
+    note(
+        f"{name}: attitudes by its pictures, {len(found.key)} of {len(numbers)} mapped,"
+        f" {laid.residual_m:.2g} m from its places; standard deviation {common_deg:.2g} deg of all,"
+        f" {picture_deg:.2g} deg of each"
+    )
+    return TurnedByPictures(
+        replace(places, t_ns=frames.t_ns[known], position=position[known], quaternion_xyzw=turned[known]),
+        with_focal(intrinsics, found.focal_ratio),
+        _with_rotation(stated, laid),
+        found,
+        entry,
+    )
+
+
+def _features(
+    film: FilmOfCamera, numbers: list[int], intrinsics: Intrinsics, progress: Progress
+) -> list[KeyFeatures]:
+    features = []
+    with film.opened() as pictures:
+        for number in numbers:
+            picture = pictures.read(number)
+            blank = np.zeros((intrinsics.height, intrinsics.width), np.uint8)
+            features.append(features_of(blank if picture is None else picture, intrinsics))
+            progress.advance()
+    return features
+
+
+def _errors(place: str, stated: Mapping[str, Mapping[str, float | str]] | None) -> PoseErrors | None:
+    """Return the prior of stated errors of places; None without, or if models of plug-ins give none."""
+    if stated is None:
+        return None
+    try:
+        errors = pose_errors(noise_models(f"{place}.pose_noise", stated))
+    except ValueError:
+        return None
+    placed = errors.white[0] > 0 or any(process.number != 3 for process in errors.processes)
+    return errors if placed else None
+
+
+def _with_rotation(
+    stated: Mapping[str, Mapping[str, float | str]] | None, laid: LaidMap
+) -> dict[str, dict[str, float | str]]:
+    """Return stated noise models of places with the found noise of attitudes."""
+    if stated is None:
+        stated = {"white": {"position_m": round(laid.residual_m, 4)}, "bias": {"position_m": UNSTATED_BIAS_M}}
+    merged: dict[str, dict[str, float | str]] = {
+        model: {key: value for key, value in values.items() if not key.startswith("rotation_deg")}
+        for model, values in stated.items()
+    }
+    for model, sigma_rad in (("bias", laid.common_sigma_rad), ("white", laid.picture_sigma_rad)):
+        merged.setdefault(model, {})["rotation_deg"] = round(float(np.degrees(sigma_rad)), 4)
+    return merged
+
+
+def store_map(found: PictureMap, folder: Path) -> None:
+    """Write a picture map."""
+    columns = {"key": found.key}
+    columns |= dict(zip(PICTURE_MAP.names[1:4], found.position.T, strict=True))
+    columns |= dict(zip(PICTURE_MAP.names[4:], found.quaternion_xyzw.T, strict=True))
+    write_table(folder / "picture_map.parquet", pd.DataFrame(columns), PICTURE_MAP)
+
+
+def load_map(folder: Path, entry: PictureMapEntry) -> PictureMap:
+    """Read a picture map; DataError if it is damaged."""
+    table = read_table(folder / "picture_map.parquet", PICTURE_MAP)
+    key: Int64 = table["key"].to_numpy(np.int64)
+    numbers = table[PICTURE_MAP.names[1:]].to_numpy(np.float64)
+    return PictureMap(key, numbers[:, :3], numbers[:, 3:], entry.points, entry.error_px, entry.focal_ratio)

@@ -1,0 +1,179 @@
+"""Attitudes by pictures, on features and places with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.cameras import project
+from pipelines.geometry.noise import PoseErrors, White, pose_errors
+from pipelines.geometry.poses import (
+    conjugate,
+    invert,
+    look_at,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+    rotation_vector_from_quaternion,
+    transform,
+)
+from pipelines.reconstruction.picture_map import (
+    MAX_BRIDGE_S,
+    KeyFeatures,
+    LaidMap,
+    NoAttitudesError,
+    PictureMap,
+    key_rows,
+    lay_on_places,
+    map_pictures,
+    poses_of_pictures,
+)
+
+LENS = Intrinsics(1280, 720, 1000.0, 1000.0, 639.5, 359.5)
+STEP_NS = 200_000_000
+KEYS = 24
+T_NS: Int64 = np.arange(KEYS, dtype=np.int64) * STEP_NS
+CENTIMETRE = pose_errors([White(position_m=0.01)])
+
+
+def flown(*, straight: bool = False, along_view: bool = False) -> tuple[Float, Float]:
+    """Return places and attitudes of a camera that flies a curve about what it films, or a line."""
+    angle = np.linspace(0, 1.2, KEYS)
+    places = np.stack([12 * np.cos(angle), 12 * np.sin(angle), 4 + np.sin(2 * angle)], axis=1)
+    if straight:
+        places = np.array([14.0, 0, 5]) + np.linspace(0, 6, KEYS)[:, None] * [0.0, 1.0, 0.0]
+    if along_view:
+        places = np.array([20.0, 0, 5]) + np.linspace(0, 6, KEYS)[:, None] * [-1.0, 0.0, 0.0]
+    target = np.tile([0.0, 0.0, 1.0], (KEYS, 1))
+    return places, look_at(places, places + np.array([-12.0, 0, -3]) if straight or along_view else target)
+
+
+def mapped(places: Float, turned: Float) -> PictureMap:
+    """Return an exact map in another frame and scale."""
+    turn = quaternion_from_rotation_vector(np.array([0.4, -1.0, 0.7]))
+    position = 0.3 * rotate(turn, places - [5.0, 1.0, 2.0])
+    return PictureMap(np.arange(len(places)), position, multiply(turn, turned), points=900, error_px=0.5)
+
+
+def errors_deg(laid: LaidMap, turned: Float) -> Float:
+    """Return the rotation vectors [K, 3] from true attitudes to found ones, about the world's axes, deg."""
+    return np.degrees(rotation_vector_from_quaternion(multiply(laid.quaternion_xyzw, conjugate(turned))))
+
+
+def test_key_pictures_are_a_fifth_to_half_a_second_apart() -> None:
+    for seconds in (3, 20, 120):
+        t_ns = np.arange(seconds * 30 + 1) * 10**9 // 30
+        rows = key_rows(t_ns)
+        steps_s = np.diff(t_ns[rows]) / 1e9
+        assert rows[0] == 0
+        assert rows[-1] == len(t_ns) - 1
+        assert steps_s.min() > 0.16
+        assert steps_s.max() < 0.54
+
+
+def test_features_of_points_give_the_map() -> None:
+    """Features are exact to 0.3 px: attitudes relative to each other come out to 0.05 deg."""
+    rng = np.random.default_rng(7)
+    places, turned = flown()
+    world = rng.uniform([-6, -6, 0], [6, 6, 5], (500, 3))
+    descriptors = rng.gamma(0.5, 40, (500, 128))
+    features = []
+    for pose in zip(places, turned, strict=True):
+        pixels = project(transform(invert(*pose), world), LENS)
+        seen = (pixels > 0).all(axis=1) & (pixels < [1279, 719]).all(axis=1) & (rng.random(500) < 0.7)
+        noisy = descriptors[seen] + rng.normal(0, 4, (int(seen.sum()), 128))
+        pixels = pixels[seen] + rng.normal(0, 0.3, (int(seen.sum()), 2))
+        xy = (pixels - [LENS.cx, LENS.cy]) / LENS.fx
+        features.append(KeyFeatures(xy, noisy.clip(0, 255).astype(np.uint8)))
+    found = map_pictures(features, LENS)
+    assert found.key.tolist() == list(range(KEYS))
+    laid = lay_on_places(found, T_NS, T_NS, places, CENTIMETRE)
+    assert np.abs(errors_deg(laid, turned)).max() < 0.1
+    assert np.linalg.norm(laid.position - places, axis=1).max() < 0.02
+
+    again = map_pictures(features, LENS)
+    assert (again.quaternion_xyzw == found.quaternion_xyzw).all()
+
+    with pytest.raises(NoAttitudesError):  # a camera that stands sees everything at the same place
+        map_pictures([features[0]] * 12, LENS)
+    with pytest.raises(NoAttitudesError):  # pictures without texture
+        map_pictures([KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8))] * 12, LENS)
+
+
+def test_attitudes_are_off_by_what_is_said_of_them() -> None:
+    """White errors of 0.1 m on a curve of some metres: 40 draws have the predicted mean square, 3 axes."""
+    places, turned = flown()
+    found, rng = mapped(places, turned), np.random.default_rng(3)
+    ratios = []
+    for _ in range(40):
+        noisy = places + rng.normal(0, 0.1, places.shape)
+        laid = lay_on_places(found, T_NS, T_NS, noisy, pose_errors([White(position_m=0.1)]))
+        common = np.radians(errors_deg(laid, turned).mean(axis=0))
+        ratios.append(float(np.square(common).sum()) / (3 * laid.common_sigma_rad**2))
+    assert 0.6 < np.mean(ratios) < 1.6
+
+
+def test_a_place_that_jumps_away_is_left_out() -> None:
+    places, turned = flown()
+    jumped = places + np.random.default_rng(1).normal(0, 0.01, places.shape)
+    jumped[5] += [30.0, -20.0, 4.0]
+    laid = lay_on_places(mapped(places, turned), T_NS, T_NS, jumped, CENTIMETRE)
+    assert np.abs(errors_deg(laid, turned)).max() < 0.3
+
+
+def test_the_horizon_levels_a_straight_flight_along_the_view() -> None:
+    """Places on a line do not say how the map turns about it; pictures without roll do, to 2 deg."""
+    places, turned = flown(along_view=True)
+    laid = lay_on_places(mapped(places, turned), T_NS, T_NS, places, CENTIMETRE)
+    assert np.abs(errors_deg(laid, turned)).max() < 0.05
+    assert 1.0 < np.degrees(laid.common_sigma_rad) < 2.0
+
+
+@pytest.mark.parametrize("what", ["straight, seen from the side", "smaller than its noise", "another path"])
+def test_places_that_do_not_say_how_the_map_lies_are_refused(what: str) -> None:
+    places, turned = flown(straight=what.startswith("straight"))
+    found, errors = mapped(places, turned), CENTIMETRE
+    if what.startswith("smaller"):
+        errors = pose_errors([White(position_m=5.0)])
+    if what == "another path":
+        walk = np.random.default_rng(2).normal(0, 1, places.shape).cumsum(axis=0)
+        places = walk - walk[0]
+    with pytest.raises(NoAttitudesError):
+        lay_on_places(found, T_NS, T_NS, places, errors)
+
+
+def test_pictures_between_keys_get_poses_but_not_across_a_gap() -> None:
+    places, turned = flown()
+    whole = mapped(places, turned)
+    kept = np.r_[0:8, 16:KEYS]  # a gap of 1.8 s
+    found = replace(
+        whole, key=kept, position=whole.position[kept], quaternion_xyzw=whole.quaternion_xyzw[kept]
+    )
+    laid = lay_on_places(found, T_NS, T_NS, places, None)
+    at_ns = np.arange(0, int(T_NS[-1]) + 1, STEP_NS // 4)
+    position, quaternion = poses_of_pictures(laid, T_NS, places, at_ns)
+    known = np.isfinite(quaternion[:, 0])
+    gaps_s = [(b - a) / 1e9 for a, b in pairwise(T_NS[kept].tolist())]
+    assert max(gaps_s) > MAX_BRIDGE_S
+    assert (known == ((at_ns <= T_NS[7]) | (at_ns >= T_NS[16]))).all()
+    assert np.isfinite(position[known]).all()
+    # The path is smooth: the spline through every fifth of a second errs by less than a centimetre.
+    on_keys = np.isin(at_ns, T_NS) & known
+    off = rotation_vector_from_quaternion(
+        multiply(quaternion[on_keys], conjugate(turned[np.searchsorted(T_NS, at_ns[on_keys])]))
+    )
+    assert np.degrees(np.abs(off)).max() < 0.05
+
+
+def test_unstated_errors_of_places_are_those_of_the_fit() -> None:
+    places, turned = flown()
+    noisy = places + np.random.default_rng(4).normal(0, 0.1, places.shape)
+    stated, unstated = (
+        lay_on_places(mapped(places, turned), T_NS, T_NS, noisy, errors)
+        for errors in (PoseErrors((0.1, 0.0), ()), None)
+    )
+    assert unstated.common_sigma_rad == pytest.approx(stated.common_sigma_rad, rel=0.4)
