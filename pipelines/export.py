@@ -23,11 +23,11 @@ from pipelines.reporting.overlays import (
     views_of,
 )
 from pipelines.reporting.pictures import Label, blank_frame, caption_of, draw_frame
-from pipelines.session.description import Description, Doubt, read_description
+from pipelines.session.description import HIP_ABOVE_POINT_M, Description, Doubt, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Recording
+from pipelines.session.records import PlannedArm, Recording
 from pipelines.session.registries import Export, ExportWithChoices, find_export
 from pipelines.session.stages import StageRecord, open_session, session_name
 from pipelines.session.storage import (
@@ -41,10 +41,12 @@ from pipelines.session.storage import (
     write_json,
 )
 from pipelines.session.tables import (
+    ACTOR,
     ANGLES,
     FRAMES,
     GAIT,
     POSES,
+    REPLAN,
     SKELETON,
     read_motion,
     read_table,
@@ -198,6 +200,8 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         pictures=_pictures(folder, description, record, pictures_hz),
         angles=lambda: _reconstructed(folder, record, "angles", ANGLES),
         gait=lambda: _reconstructed(folder, record, "gait", GAIT),
+        planned=lambda: _planned(folder, session.intact_record("replan")),
+        place=description.origin and description.origin.place,
         doubts=lambda: [doubt.as_warning() for doubt in _doubts(folder, description, record)],
         zero_ns=description.start_ns,
         people=() if motion is None else tuple(description.names_of_people(motion.position.shape[1])),
@@ -222,6 +226,23 @@ def _doubts(folder: Path, description: Description, record: StageRecord | None) 
         return description.doubts
     stored = read_json(folder / "reconstruct" / "metrics.json").get("doubts", [])
     return [Doubt.model_validate(doubt) for doubt in stored]
+
+
+def _planned(folder: Path, record: StageRecord | None) -> list[PlannedArm]:
+    """Return the planners' arms of the last comparison."""
+    if record is None:
+        return []
+    actor = read_table(folder / "replan" / "actor.parquet", ACTOR)
+    ground_m = float(actor["z"].iloc[0]) - HIP_ABOVE_POINT_M["feet"]
+    arms = []
+    for name, facts in read_json(folder / "replan" / "metrics.json")["arms"].items():
+        if facts["simulated"]:
+            table = read_table(folder / "replan" / name / "trajectories.parquet", REPLAN)
+            drones = {drone: trajectory_from(rows) for drone, rows in table.groupby("camera", sort=False)}
+            counts = {limit: count for limit, count in facts["limit_violations"].items() if count}
+            broken = ", ".join(f"{limit} {count} times" for limit, count in counts.items())
+            arms.append(PlannedArm(name, drones, ground_m, broken))
+    return arms
 
 
 Stills = Callable[[str], Iterable[tuple[int, Picture]]]

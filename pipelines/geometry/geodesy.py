@@ -54,9 +54,14 @@ def geodetic_from_ecef(from_centre: Float) -> tuple[Float, Float, Float]:
     return np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude
 
 
+def geodetic_from_enu(enu: Float, origin: Place) -> tuple[Float, Float, Float]:
+    """Compute latitude and longitude in degrees and height in metres of points [..., 3] m of a place."""
+    return geodetic_from_ecef(enu @ _enu_axes(origin) + _ecef_of(origin))
+
+
 def place_at(enu: Float, origin: Place) -> Place:
     """Find the place that lies at metres [3] east, north and up of another."""
-    latitude, longitude, altitude = geodetic_from_ecef(enu @ _enu_axes(origin) + _ecef_of(origin))
+    latitude, longitude, altitude = geodetic_from_enu(enu, origin)
     return Place(float(latitude), float(longitude), float(altitude))
 
 

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pipelines.geometry.arrays import DistortionModel, Intrinsics
+from pipelines.geometry.arrays import DistortionModel, Intrinsics, Place
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import hash_of, read_json, refuse_camera_names, refuse_newer
@@ -161,6 +161,11 @@ class OriginEntry(Entry):
     longitude_deg: float
     altitude_m: float
     source: str  # "world.origin", or the log whose first position is the origin
+
+    @property
+    def place(self) -> Place:
+        """The place itself."""
+        return Place(self.latitude_deg, self.longitude_deg, self.altitude_m)
 
 
 class PictureMapEntry(Entry):

@@ -21,6 +21,7 @@ CODES = {
     "exists": "something would be overwritten",
     "incomplete": "a drafted flight.yaml lacks what only the user knows, or assumes what is not right",
     "keypoints-normalised": "The keypoints are shares of the picture, and not pixels.",
+    "limits-broken": "every planned flight breaks limits of safety",
     "losses": "data were lost, and --strict was given",
     "missing-column": "a table lacks a column or a header",
     "missing-library": "a library that is not installed is needed",

@@ -111,6 +111,16 @@ class SkeletalMotion:
 
 
 @dataclass(frozen=True)
+class PlannedArm:
+    """Flights of a planner's arm in the last comparison."""
+
+    name: str
+    drones: Mapping[str, Trajectory]  # world_from_camera
+    ground_m: float  # height of the ground under the actor at the start, world
+    broken: str = ""  # limits that it breaks, with how often
+
+
+@dataclass(frozen=True)
 class Recording:
     """Everything that an export may need: the skeleton, the cameras that it was made with, and the maps.
 
@@ -137,6 +147,9 @@ class Recording:
     """Rows of `tables.GAIT`; None without a reconstruction."""
     doubts: Callable[[], Sequence[str]] = tuple
     """Sentences on what contradicts itself in the flight."""
+    planned: Callable[[], Sequence[PlannedArm]] = tuple
+    """The arms of the last comparison of planners; none without one."""
+    place: Place | None = None  # where the world's zero lies on Earth, if known
     unit: str | None = None  # of lengths, if the user chooses one that the export has
     axes: str | None = None  # z-up or y-up, if the user chooses them
     zero_ns: int = 0  # the time that formats in seconds count from, if they have the choice; 0 is the epoch

@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 from mocap_cli.main import Mocap
 from mocap_cli.replan_compare import replan_compare_command
 from pipelines.detect import DETECT
+from pipelines.export import load_recording
 from pipelines.ingest import ingest
 from pipelines.planning.replay import fly_arm
 from pipelines.reconstruct import ReconstructSettings, reconstruct
@@ -259,6 +260,21 @@ def test_an_interrupted_comparison_flies_only_what_is_missing(
     assert flown == ["adaptive", "fixed", "fixed"]
     assert not (calm / ".partial").exists()
     assert whole == compared(calm, "--arms", "adaptive,fixed", "--trials", "2", "--force")
+
+
+def test_an_export_takes_the_planned_flights_and_the_limits_that_they_break(
+    mound: Path, at_the_mound: Any
+) -> None:
+    recording = load_recording(mound)
+    arms = {arm.name: arm for arm in recording.planned()}
+    assert (list(arms), recording.place) == (["adaptive", "fixed"], None)
+    ground_m = pd.read_parquet(mound / "replan" / "actor.parquet")["z"].iloc[0] - 0.95
+    for name, arm in arms.items():
+        table = pd.read_parquet(mound / "replan" / name / "trajectories.parquet")
+        assert set(arm.drones) == set(table["camera"])
+        assert sum(len(track.t_ns) for track in arm.drones.values()) == len(table)
+        assert arm.ground_m == pytest.approx(ground_m)
+        assert bool(arm.broken) == any(at_the_mound["arms"][name]["limit_violations"].values())
 
 
 def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:

@@ -173,7 +173,7 @@ class McapExport:
             raise DataError(
                 recording.name, "has times outside of 1970 to 2038, which ROS cannot count", "export csv"
             )
-        topics = _topics(list(tracks))
+        topics = topics_of(list(tracks))
         streams = [_map(recording, start_ns), _doubts(recording, start_ns)]
         for name, track in tracks.items():
             lens = recording.lenses.get(name)
@@ -202,7 +202,7 @@ def _countable(recording: Recording, name: str, track: Trajectory) -> Trajectory
     return Trajectory(track.t_ns[early:], track.position[early:], track.quaternion_xyzw[early:])
 
 
-def _topics(cameras: list[str]) -> dict[str, str]:
+def topics_of(cameras: list[str]) -> dict[str, str]:
     """Return a valid ROS topic name for each camera, without duplicates."""
     topics: dict[str, str] = {}
     for name in cameras:
