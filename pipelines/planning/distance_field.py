@@ -208,7 +208,8 @@ def fill_bricks(grid: Grid, bricks: NDArray[np.uint8]) -> None:
                 bricks[i // BRICK, j // BRICK, k // BRICK, within] = 2 * leap + (d[i, j, k] < 0.0)
 
 
-Unknown = Literal["free", "occupied"]
+Unknown = Literal["free", "occupied", "avoided"]
+"""What nothing is known of: free, an obstacle that hides, or an obstacle that cameras see through."""
 
 
 @dataclass(frozen=True)
@@ -221,26 +222,20 @@ class DistanceField:
 
     grid: Grid
     from_ns: int = 0  # the time from which the map holds
+    hiding: Grid | None = None  # of what hides, if cameras see through some of what drones avoid; else `grid`
 
     @cached_property
     def sight(self) -> Sight:
         """Field for the sight lines of the cost map; made at first use, one byte per voxel."""
         wide, deep, high = self.grid.distance_m.shape
         bricks = np.zeros((-(-wide // BRICK), -(-deep // BRICK), -(-high // BRICK), BRICK**3), np.uint8)
-        fill_bricks(self.grid, bricks)
+        fill_bricks(self.hiding or self.grid, bricks)
         return Sight(bricks, (wide, deep, high))
 
     @property
     def has_obstacles(self) -> bool:
         """True if anything is occupied."""
         return bool((self.grid.distance_m < 0.0).any())
-
-    def covers(self, points: Float) -> NDArray[np.bool_]:
-        """Test which points [..., 3] lie in the grid's box."""
-        grid = self.grid
-        place = (points - grid.origin) / grid.resolution_m
-        inside = (place >= 0) & (place < np.array(grid.distance_m.shape))
-        return np.asarray(inside.all(axis=-1), dtype=np.bool_)
 
     def sample(self, points: Float) -> tuple[Float, Float]:
         """Compute distances [...] to obstacles, and their gradients [..., 3].
@@ -263,8 +258,16 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
     """
     with np.errstate(invalid="ignore"):
         occupied = occupancy.probability >= OCCUPIED
-    if unknown == "occupied":
-        occupied |= np.isnan(occupancy.probability)
+    is_unknown = np.isnan(occupancy.probability)
+    hiding = None
+    if unknown == "avoided" and is_unknown.any():
+        hiding = _grid(occupied, occupancy)
+    if unknown != "free":
+        occupied |= is_unknown
+    return DistanceField(_grid(occupied, occupancy), occupancy.from_ns, hiding)
+
+
+def _grid(occupied: NDArray[np.bool_], occupancy: Occupancy) -> Grid:
     half = occupancy.resolution_m / 2
     if not occupied.any():
         distance = np.full(occupied.shape, NOWHERE_M, dtype=np.float32)
@@ -284,7 +287,7 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
             distance = np.repeat(distance, 2, axis=axis)
     distance = np.ascontiguousarray(distance)
     origin = np.array(occupancy.origin, dtype=np.float64)
-    return DistanceField(Grid(distance, origin, float(occupancy.resolution_m)), occupancy.from_ns)
+    return Grid(distance, origin, float(occupancy.resolution_m))
 
 
 def _box_around(occupied: NDArray[np.bool_]) -> tuple[slice, ...]:
@@ -355,7 +358,7 @@ def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float
     """
     camera, actor = np.broadcast_arrays(camera, actor)
     seen = np.empty(camera.shape[:-1], dtype=np.bool_)
-    _traverse(field.grid, _flat(camera), _flat(actor), start_m, seen.reshape(-1))
+    _traverse(field.hiding or field.grid, _flat(camera), _flat(actor), start_m, seen.reshape(-1))
     return seen
 
 

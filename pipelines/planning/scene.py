@@ -14,6 +14,7 @@ from pipelines.geometry.noise import NoiseModel, White, sum_sigma
 from pipelines.geometry.poses import gaps, interpolate_points, rates
 from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
 from pipelines.planning.distance_field import (
+    OCCUPIED,
     DistanceField,
     MapsInTurn,
     Unknown,
@@ -29,7 +30,7 @@ from pipelines.planning.formation import (
 )
 from pipelines.planning.local import tracking_times
 from pipelines.session.camera_poses import COMMAND_LINE, known_variances, poses_at, stated_models
-from pipelines.session.description import CameraEntry, Description, Interpolation
+from pipelines.session.description import HIP_ABOVE_POINT_M, CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError
 from pipelines.session.people import logged_people
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
@@ -59,6 +60,10 @@ COMMAND_HOLDS_NS = 2_000_000_000
 MIN_FLIGHT_S = 1.0
 # People without a common time are matched last: no distance is as large.
 NEVER_TOGETHER_M = 1e6
+# Voxels of 0.5 m, soft ground and errors of the hips explain less between the map's ground and the feet.
+LARGEST_OFFSET_M = 1.0
+# Probabilities are 0 to 1, so that this marks places beyond the map.
+OUTSIDE = -1.0
 # Others who are reconstructed at less than half of the first person's times are not filmed again.
 MIN_SHARE_OF_TIMES = 0.5
 
@@ -512,8 +517,9 @@ class ReplayScene:
         skeleton, t_ns = self.flight.skeleton, self.t_ns[self.pictures]
         return None if skeleton is None else points_at(skeleton, t_ns).reshape(len(t_ns), -1, 3)
 
-    def _first_slots(self) -> Float:
-        """Compute the places [N, T, 3] of the slots of the start's formation."""
+    @property
+    def first_slots(self) -> Float:
+        """The places [N, T, 3] of the slots of the start's formation."""
         slots = formation_slots(
             np.array(self.yaw_rad), self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
         )
@@ -522,7 +528,7 @@ class ReplayScene:
     def start_slots_inside(self) -> int:
         """Count the slots of the start that are within the drones' radius of an obstacle, or in it."""
         (_, first), *_ = self.maps_at(self.t_ns[:1])
-        clearance_m = first.sample(self._first_slots()[:, 0])[0]
+        clearance_m = first.sample(self.first_slots[:, 0])[0]
         return int((clearance_m < self.config.drone_radius_m).sum())
 
 
@@ -539,10 +545,9 @@ def build_scene(
     `errors` are those of the detector, by default as in `ErrorModel`; those of the poses are the flight's.
     """
     notes = []
-    unknown: Unknown = "occupied" if description.map and description.map.unknown == "occupied" else "free"
-    fields = tuple(
-        sorted((distance_field(one, unknown=unknown) for one in maps), key=lambda field: field.from_ns)
-    )
+    unknown: Unknown = description.map.unknown if description.map else "free"
+    maps = sorted(maps, key=lambda one: one.from_ns)
+    fields = tuple(distance_field(one, unknown=unknown) for one in maps)
     notes.append(
         f"unknown voxels of the map count as {unknown}" if fields else "no map: open space, nothing is hidden"
     )
@@ -578,7 +583,7 @@ def build_scene(
         notes=tuple(notes),
         warnings=(),
     )
-    return replace(scene, warnings=(*flight.warnings, *_doubts(scene)))
+    return replace(scene, warnings=(*flight.warnings, *_map_doubts(scene, maps), *_doubts(scene)))
 
 
 def with_pose_errors(
@@ -605,22 +610,63 @@ def with_pose_errors(
     )
 
 
+def _map_doubts(scene: ReplayScene, maps: Sequence[Occupancy]) -> list[str]:
+    """List what the maps (in the order of `scene.fields`) lack where people walk and drones fly."""
+    doubts = []
+    if scene.fields and not any(field.has_obstacles for field in scene.fields):
+        doubts.append("nothing in the map is occupied")
+    held = {id(field): one for field, one in zip(scene.fields, maps, strict=True)}
+    shown = [(rows, held[id(field)]) for rows, field in scene.maps if id(field) in held]
+    ways = {"the actor's way": scene.people, "the way of the drones' first slots": scene.first_slots}
+    for name, way in ways.items() if shown else ():
+        found = np.concatenate([_probability_at(one, way[:, rows]).ravel() for rows, one in shown])
+        outside, unknown = float((found == OUTSIDE).mean()), float(np.isnan(found).mean())
+        if outside > 0.0:
+            doubts.append(
+                f"the map does not cover {100 * outside:.0f} % of {name}: what lies outside is free"
+            )
+        if unknown > 0.0:
+            doubts.append(f"the map knows nothing of {100 * unknown:.0f} % of {name}")
+    above = [_ground_above_feet(one, scene.people[:, rows].reshape(-1, 3)) for rows, one in shown]
+    known = np.concatenate(above) if above else np.empty(0)
+    known = known[np.isfinite(known)]
+    if len(known) and abs(offset_m := float(np.median(known))) > LARGEST_OFFSET_M:
+        side = "above" if offset_m > 0 else "below"
+        doubts.append(f"the map's ground is {abs(offset_m):.1f} m {side} the actor's feet: check its heights")
+    return doubts
+
+
+def _probability_at(occupancy: Occupancy, points: Float) -> Float:
+    """Look up the voxels of points [..., 3]: NaN where unknown, `OUTSIDE` beyond the map."""
+    place = np.floor((points - occupancy.origin) / occupancy.resolution_m).astype(np.int64)
+    inside = ((place >= 0) & (place < occupancy.probability.shape)).all(axis=-1)
+    found = np.full(inside.shape, OUTSIDE)
+    found[inside] = occupancy.probability[tuple(place[inside].T)]
+    return found
+
+
+def _ground_above_feet(occupancy: Occupancy, hips: Float) -> Float:
+    """Compute how far the map's ground is above the feet [K] of hips [K, 3]; NaN where it shows none.
+
+    The ground is the top of the lowest occupied voxels of a column: others may be roofs.
+    """
+    place = np.floor((hips - occupancy.origin) / occupancy.resolution_m).astype(np.int64)[:, :2]
+    inside = ((place >= 0) & (place < occupancy.probability.shape[:2])).all(axis=1)
+    above = np.full(len(hips), np.nan)
+    columns = occupancy.probability[tuple(place[inside].T)] >= OCCUPIED
+    first = columns.argmax(axis=1)
+    free = ~columns & (np.arange(columns.shape[1]) > first[:, None])
+    top = np.where(free.any(axis=1), free.argmax(axis=1), columns.shape[1])
+    ground = occupancy.origin[2] + top * occupancy.resolution_m
+    feet = hips[inside, 2] - HIP_ABOVE_POINT_M["feet"]
+    above[inside] = np.where(columns.any(axis=1), ground - feet, np.nan)
+    return above
+
+
 def _doubts(scene: ReplayScene) -> list[str]:
-    """List problems of the maps, the start and the skeleton, one line each."""
+    """List problems of the start and the skeleton, one line each."""
     doubts = []
     fields = scene.fields
-    if fields and not any(field.has_obstacles for field in fields):
-        doubts.append("nothing in the map is occupied")
-    covered = [
-        field.covers(scene.people[:, rows]).mean(axis=0)
-        for rows, field in scene.maps
-        if any(field is one for one in fields)
-    ]
-    outside = float(1.0 - np.concatenate(covered).mean()) if covered else 0.0
-    if outside > 0.0:
-        doubts.append(
-            f"the map does not cover {100 * outside:.0f} % of the actor's way: what lies outside is free"
-        )
     if fields and fields[0].from_ns > scene.t_ns[0]:
         late_s = min((fields[0].from_ns - int(scene.t_ns[0])) / 1e9, float(scene.t_s[-1]))
         doubts.append(f"the first map comes {late_s:.1f} s after the start: nothing is known until then")

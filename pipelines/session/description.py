@@ -244,7 +244,7 @@ class MapEntry(Entry):
     """The maps of the surroundings; the figures beside `maps` are those of the last map."""
 
     source: str
-    unknown: str  # state that the planner assumes for unknown voxels
+    unknown: Literal["free", "occupied", "avoided"]  # state that the planner assumes for unknown voxels
     resolution_m: float
     shape: list[int]
     occupied: int

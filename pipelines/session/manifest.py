@@ -572,8 +572,8 @@ class MapSource(ProjectedSource, FileSource):
     """Source of the map of the surroundings."""
 
     part = "map"
-    unknown: Literal["free", "occupied"] = "free"
-    """State of voxels that nothing is known of."""
+    unknown: Literal["free", "occupied", "avoided"] = "free"
+    """Voxels that nothing is known of: free, occupied, or avoided by drones but not in a camera's way."""
     resolution_m: float | None = Field(None, gt=0)
     """Side of the voxels that a cloud of points is divided into, m."""
 

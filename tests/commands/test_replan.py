@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,11 @@ from pipelines.detect import DETECT
 from pipelines.export import load_recording
 from pipelines.ingest import ingest
 from pipelines.planning.replay import fly_arm
+from pipelines.planning.scene import ReplanSettings, build_scene, load_flight
 from pipelines.reconstruct import ReconstructSettings, reconstruct
+from pipelines.session.description import read_description
+from pipelines.session.maps import load_maps
+from pipelines.session.records import Occupancy
 from pipelines.session.stages import locked
 from pipelines.simulate import simulate
 from tests.commands.runner import as_if_written, content
@@ -349,6 +354,29 @@ def test_what_the_map_and_the_log_leave_open_is_said(tmp_path: Path) -> None:
         assert arm["safety"]["left"] > 0
     assert metrics["warnings"][0].startswith("adaptive ")
     assert "(once)" in metrics["warnings"][0]
+
+
+def test_what_a_map_lacks_about_the_ways_is_said(calm: Path) -> None:
+    """Raise the map by 6 m, and forget it up to the middle of the way."""
+    description = read_description(calm)
+    flight = load_flight(calm, description, None, pose_noise=None)
+    (whole,) = load_maps(calm)
+
+    def new_warnings(occupancy: Occupancy) -> list[list[str]]:
+        scenes = [build_scene(flight, [one], description, ReplanSettings()) for one in (whole, occupancy)]
+        lines = [line for line in scenes[1].warnings if line not in scenes[0].warnings]
+        return [re.findall(r"\d+(?:\.\d+)?", line) for line in lines]
+
+    assert ["6.0"] in new_warnings(replace(whole, origin=whole.origin + np.array([0.0, 0.0, 6.0])))
+    probability = whole.probability.copy()
+    known_from = round((2.0 - whole.origin[0]) / whole.resolution_m)
+    probability[:known_from] = np.nan
+    (actor, *_), (slots, *_) = new_warnings(replace(whole, probability=probability))
+    scene = build_scene(flight, [whole], description, ReplanSettings())
+    unknown = scene.people[..., 0] < whole.origin[0] + known_from * whole.resolution_m
+    assert 20 < 100 * unknown.mean() < 80
+    assert int(actor) == round(100 * unknown.mean())
+    assert 0 < int(slots) < 100
 
 
 def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pipelines.planning.distance_field import (
     distance_field,
     in_turn,
+    visible,
 )
 from pipelines.session.records import Occupancy
 
@@ -56,6 +57,20 @@ def test_unknown_is_free_or_occupied_as_asked() -> None:
     blocked = distance_field(slab(unknown_above=True), unknown="occupied")
     assert blocked.sample(point)[0] == pytest.approx(-1.0, abs=1e-5)
     assert blocked.from_ns == 7
+
+
+def test_cameras_see_through_what_drones_avoid() -> None:
+    """Look down through the unknown at a place above the slab: clearance as if occupied, sight as if free."""
+    camera, actor = np.array([[0.0, 0.0, 3.8]]), np.array([[0.0, 0.0, 1.3]])
+    fields = {
+        word: distance_field(slab(unknown_above=True), unknown=word)
+        for word in ("free", "occupied", "avoided")
+    }
+    clearance_m = {word: float(field.sample(camera)[0][0]) for word, field in fields.items()}
+    assert clearance_m["avoided"] == clearance_m["occupied"] < 0 < clearance_m["free"]
+    seen = {word: bool(visible(field, camera, actor, start_m=0.0)[0]) for word, field in fields.items()}
+    assert seen == {"free": True, "occupied": False, "avoided": True}
+    np.testing.assert_array_equal(fields["avoided"].sight.bricks, fields["free"].sight.bricks)
 
 
 def test_each_map_holds_from_its_own_time_on() -> None:
