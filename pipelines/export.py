@@ -201,7 +201,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         angles=lambda: _reconstructed(folder, record, "angles", ANGLES),
         gait=lambda: _reconstructed(folder, record, "gait", GAIT),
         planned=lambda: _planned(folder, session.intact_record("replan")),
-        place=description.origin and description.origin.place,
+        place=description.origin.place if description.origin else None,
         doubts=lambda: [doubt.as_warning() for doubt in _doubts(folder, description, record)],
         zero_ns=description.start_ns,
         people=() if motion is None else tuple(description.names_of_people(motion.position.shape[1])),
@@ -238,7 +238,9 @@ def _planned(folder: Path, record: StageRecord | None) -> list[PlannedArm]:
     for name, facts in read_json(folder / "replan" / "metrics.json")["arms"].items():
         if facts["simulated"]:
             table = read_table(folder / "replan" / name / "trajectories.parquet", REPLAN)
-            drones = {drone: trajectory_from(rows) for drone, rows in table.groupby("camera", sort=False)}
+            drones = {
+                str(drone): trajectory_from(rows) for drone, rows in table.groupby("camera", sort=False)
+            }
             counts = {limit: count for limit, count in facts["limit_violations"].items() if count}
             broken = ", ".join(f"{limit} {count} times" for limit, count in counts.items())
             arms.append(PlannedArm(name, drones, ground_m, broken))
