@@ -42,7 +42,7 @@ from benchmarks import detectors, gimbals, people
 from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
 from benchmarks.results import fixed, keep, markdown_table
-from pipelines.detect import Following, detect
+from pipelines.detect import detect, follow
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
 from pipelines.geometry.metrics import measure
@@ -271,7 +271,7 @@ def measure_draw(
             with locked(session) as writable:
                 detect(writable, detector=first.detector)
                 if flight.with_pictures:
-                    Following(writable).finish()
+                    follow(writable)
             for case in cases:
                 timed = case is first and not case.draw
                 method = METHODS["robust" if case.method in _POSES else case.method]

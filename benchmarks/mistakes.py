@@ -28,7 +28,7 @@ from benchmarks.corpus.drawn import DrawnFlight, Given, kept_in_place_of_picture
 from benchmarks.corpus.stored import DETECTORS, HALVES, Flight, Half, flights
 from benchmarks.results import fixed, keep, markdown_table
 from pipelines.check import check
-from pipelines.detect import Following, detect
+from pipelines.detect import detect, follow
 from pipelines.ingest import ingest
 from pipelines.session.description import Doubt
 from pipelines.session.stages import locked
@@ -176,7 +176,7 @@ def _doubted(
     with kept_in_place_of_pictures(flight, DETECTORS[0]), locked(session) as writable:
         detect(writable, detector=DETECTORS[0])
         if flight.with_pictures:
-            Following(writable).finish()
+            follow(writable)
     return check(session).doubts
 
 

@@ -15,10 +15,10 @@ from typing import Any
 from pipelines.detect import (
     BACKGROUND,
     DETECT,
-    Following,
     cameras_to_detect,
     cameras_to_follow,
     detect,
+    follow,
 )
 from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
@@ -194,11 +194,6 @@ def _detected(
     first, last = max(each.first_t_ns for each in frames), min(each.last_t_ns for each in frames)
     middle_s = ((first + last) / 2 - description.start_ns) / 1e9
     start_s, end_s = max(0.0, middle_s - LOOK_S / 2), middle_s + LOOK_S / 2
-    following = None
-    moving = cameras_to_follow(description)
-    # Of imported keypoints, all pictures would have to be decoded.
-    if moving and all(description.cameras[name].keypoints is None for name in moving):
-        following = Following(session, every=LOOK_EVERY, span_s=(start_s, end_s))
     record = detect(
         session,
         detector=detector,
@@ -207,8 +202,10 @@ def _detected(
         end_s=end_s,
         workers=workers,
         progress=progress,
-        following=following,
     )
-    if following is not None:
-        following.finish(workers=workers, progress=progress)
+    moving = cameras_to_follow(description)
+    # Of imported keypoints, all pictures would have to be decoded.
+    if moving and all(description.cameras[name].keypoints is None for name in moving):
+        span_s = (start_s, end_s)
+        follow(session, every=LOOK_EVERY, span_s=span_s, workers=workers, progress=progress)
     return record, f"every third picture from {start_s:.1f} to {end_s:.1f} s"

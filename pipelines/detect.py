@@ -1,8 +1,7 @@
 """Stages `detect` and `background`: people and background in the pictures.
 
 A keypoint detector looks at the pictures of every camera that has no imported keypoints. Points of the
-background are followed through those of every moving camera, and stills are kept; the detector hands over the
-pictures that it decodes anyway, others are decoded for it.
+background are followed through those of every moving camera, and stills are kept.
 
 Pictures are taken in blocks of fixed length, so that blocks can be worked on side by side and an interrupted
 run continues with those that are missing; the result does not depend on either. People are followed from the
@@ -18,7 +17,7 @@ their times only. Other poses, clocks and calibrations also change where the act
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bytes, Float, Int64, Picture
+from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.keypoints.search import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.reconstruction.background_tracks import Follower, rows_to_follow, still_name, tracks_path
@@ -120,7 +119,6 @@ def detect(
     end_s: float | None = None,
     workers: int = 1,
     force: bool = False,
-    following: Following | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> StageRecord | None:
@@ -136,7 +134,6 @@ def detect(
         end_s: use only pictures before this time; by default to the last.
         workers: the number of processes of this machine; the result does not depend on it.
         force: run it again even if nothing changed.
-        following: is shown the pictures too.
         executor: works on the blocks instead of these processes.
         progress: receives the progress.
 
@@ -192,7 +189,7 @@ def detect(
         )
     progress.start("Detecting keypoints", pictures)
     workers = 1 if pictures < MIN_PICTURES_FOR_PROCESSES else workers
-    folders = _detected(run, work, blocks, chosen, people == 1, following, workers, executor, progress)
+    folders = _detected(run, work, blocks, chosen, people == 1, workers, executor, progress)
     counts = _assemble(run.folder, media, blocks, folders)
     _refuse_nobody(session.folder, counts, pictures)
     joints = list(read_json(folders[0] / "counts.json")["joints"])
@@ -411,11 +408,10 @@ class _DetectionOrder:
     only_one: bool
     every: int
     block: Block
-    followed: FollowedBlock | None
 
 
-def detect_block(order: _DetectionOrder) -> tuple[dict[str, bytes], dict[str, bytes] | None]:
-    """Detect on a worker; return the files of the block, and those of its background.
+def detect_block(order: _DetectionOrder) -> dict[str, bytes]:
+    """Detect on a worker; return the files of the block.
 
     DataError: the worker has no such session, pictures or models, or others.
     """
@@ -430,15 +426,9 @@ def detect_block(order: _DetectionOrder) -> tuple[dict[str, bytes], dict[str, by
     description = read_description(folder)
     work = _Work(folder, description, order.every, (None, None))
     hints = _Hints(folder, description, [order.block.camera], only_one=order.only_one)
-    part = None if order.followed is None else FollowedPart(order.followed)
     with TemporaryDirectory() as place:
-        detected, followed = Path(place, "detected"), Path(place, "followed")
-        detected.mkdir()
-        followed.mkdir()
-        _produce(work, hints, order.detector, order.only_one, part, order.block, detected)
-        if part is not None:
-            part.write(followed)
-        return contents_of(detected), None if part is None else contents_of(followed)
+        _produce(work, hints, order.detector, order.only_one, order.block, Path(place))
+        return contents_of(Path(place))
 
 
 def _detected(
@@ -447,7 +437,6 @@ def _detected(
     blocks: Sequence[Block],
     detector: Detector,
     only_one: bool,
-    following: Following | None,
     workers: int,
     executor: Executor | None,
     progress: Progress,
@@ -455,29 +444,17 @@ def _detected(
     """Return the folders of all blocks; those that no earlier run finished are worked on now."""
     session, models = SharedSession.at(work.folder), hashes_of_models(detector)
     missing = [block for block in blocks if not run.has_chunk(block.name)]
-    orders = [
-        _DetectionOrder(session, detector, models, only_one, work.every, block, _followed(following, block))
-        for block in missing
-    ]
+    orders = [_DetectionOrder(session, detector, models, only_one, work.every, block) for block in missing]
     progress.advance(sum(work.pictures(block) for block in blocks if block not in missing))
-    made = {block: run.chunk(block.name, _never) for block in blocks if block not in missing}
     with closing(each_part(detect_block, orders, workers=workers, executor=executor)) as found:
-        for number, (detected, followed) in found:
-            block, background = missing[number], orders[number].followed
-            if following is not None and background is not None and followed is not None:
-                following.keep(background, partial(write_contents, followed))
-            made[block] = run.chunk(block.name, partial(write_contents, detected))
-            progress.advance(work.pictures(block))
-    return [made[block] for block in blocks]
+        for number, contents in found:
+            run.chunk(missing[number].name, partial(write_contents, contents))
+            progress.advance(work.pictures(missing[number]))
+    return [run.chunk(block.name, _never) for block in blocks]
 
 
 def _never(place: Path) -> None:
     raise RuntimeError(f"{place} was finished before")
-
-
-def _followed(following: Following | None, block: Block) -> FollowedBlock | None:
-    """Return the block of the background that is followed through the pictures of a detector's block."""
-    return None if following is None else following.block(block.camera, block.first)
 
 
 def _produce(
@@ -485,28 +462,22 @@ def _produce(
     hints: _Hints,
     detector: Detector,
     only_one: bool,
-    part: FollowedPart | None,
     block: Block,
     folder: Path,
 ) -> None:
-    """Write what the detector finds in the pictures of one block, and show them to a background's part."""
+    """Write what the detector finds in the pictures of one block."""
     networks = _networks(detector)
     frame, t_ns = work.frames(block)
     tracker = PeopleTracker(networks, only_one=only_one)
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
-    before = [] if part is None or part.block.before is None else [part.block.before]
     numbers = frame.tolist()
     # Left early, the pictures must not be closed while the next one is being decoded.
     with (
         open_pictures(work.folder, work.description, block.camera) as pictures,
-        closing(_decoded_ahead(pictures, before + numbers)) as decoded,
+        closing(_decoded_ahead(pictures, numbers)) as decoded,
     ):
-        if part is not None and before:
-            part.see(before[0], next(decoded))
         for number, picture, hints_here in zip(numbers, decoded, hints.at(block.camera, t_ns), strict=True):
-            if part is not None:
-                part.see(number, picture)
             if picture is None:
                 undecoded += 1
                 continue
@@ -593,195 +564,149 @@ class FollowedBlock:
         return f"{self.camera}-{self.first:09d}"
 
 
-class FollowedPart:
-    """Background of one block, whose pictures are shown to it in their order.
-
-    Args:
-        block: the pictures; others that are shown are left out.
-    """
-
-    def __init__(self, block: FollowedBlock) -> None:
-        self.block = block
-        self._numbers = frozenset(
-            [*block.numbers.tolist(), *([] if block.before is None else [block.before])]
-        )
-        self._follower = Follower()
-        self._stills: dict[int, Bytes] = {}
-        self._undecoded = 0
-
-    def see(self, number: int, picture: Picture | None) -> None:
-        """Follow the points into the next picture; None if it cannot be decoded."""
-        import cv2
-
-        if number not in self._numbers:
-            return
-        grey = None if picture is None else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
-        self._follower.step(number, grey)
-        if number == self.block.before:
-            return
-        if grey is None:
-            self._undecoded += 1
-        elif number in self.block.stills:
-            _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-            self._stills[number] = np.asarray(encoded, np.uint8)
-
-    def write(self, folder: Path) -> None:
-        """Write tracks and stills."""
-        import pandas as pd
-
-        tracks = self._follower.tracks()
-        columns = {"frame": tracks.picture, "point": tracks.point, "x": tracks.xy[:, 0], "y": tracks.xy[:, 1]}
-        write_table(folder / "tracks.parquet", pd.DataFrame(columns), TRACKS)
-        for number, encoded in self._stills.items():
-            (folder / still_name(number)).write_bytes(encoded.tobytes())
-        points = int(tracks.point.max(initial=-1)) + 1
-        counts = {"pictures": len(self.block.numbers), "undecoded": self._undecoded}
-        write_json(folder / "counts.json", counts | {"points": points, "stills": len(self._stills)})
-
-
 def follow_block(order: tuple[SharedSession, FollowedBlock]) -> dict[str, bytes]:
-    """Follow through the pictures of a block on a worker; return its files.
+    """Follow points through the pictures of a block on a worker, and keep stills; return its files.
 
     DataError: the worker has no such session or pictures, or others.
     """
+    import cv2
+    import pandas as pd
+
     session, block = order
     folder = session.opened()
-    part = FollowedPart(block)
+    follower, stills, undecoded = Follower(), dict[int, bytes](), 0
     before = [] if block.before is None else [block.before]
     with open_pictures(folder, read_description(folder), block.camera) as pictures:
         for number in before + block.numbers.tolist():
-            part.see(number, pictures.read(number))
-    with TemporaryDirectory() as place:
-        part.write(Path(place))
-        return contents_of(Path(place))
+            picture = pictures.read(number)
+            grey = (
+                None if picture is None else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
+            )
+            follower.step(number, grey)
+            if grey is None:
+                undecoded += number != block.before
+            elif number in block.stills:
+                _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                stills[number] = encoded.tobytes()
+    tracks = follower.tracks()
+    columns = {"frame": tracks.picture, "point": tracks.point, "x": tracks.xy[:, 0], "y": tracks.xy[:, 1]}
+    counts = {"pictures": len(block.numbers), "undecoded": undecoded}
+    counts |= {"points": int(tracks.point.max(initial=-1)) + 1, "stills": len(stills)}
+    with TemporaryDirectory() as name:
+        place = Path(name)
+        write_table(place / "tracks.parquet", pd.DataFrame(columns), TRACKS)
+        write_json(place / "counts.json", counts)
+        return contents_of(place) | {still_name(number): still for number, still in stills.items()}
 
 
-class Following:
-    """One run of the stage.
+def follow(
+    session: WritableSession,
+    *,
+    every: int = 1,
+    span_s: tuple[float | None, float | None] = (None, None),
+    workers: int = 1,
+    force: bool = False,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> StageRecord:
+    """Follow the backgrounds of all moving cameras with pictures.
 
     Args:
         session: locked by the caller.
-        every: the detector uses only every k-th picture.
+        every: the detector uses only every k-th picture; so is the background of cameras that it looks at.
         span_s: times between which the detector looks at pictures, None for no bound.
+        workers: the number of processes of this machine; the result does not depend on it.
         force: run it again even if nothing changed.
+        executor: works on the blocks instead of these processes.
+        progress: receives the progress.
 
-    DataError: no moving camera has pictures, or these are not those that were ingested.
+    DataError: no moving camera has pictures, or these are gone or not those that were ingested.
     """
+    progress = progress or Silent()
+    folder = session.folder
+    description = read_description(folder)
+    names = cameras_to_follow(description)
+    if not names:
+        raise DataError(
+            "the backgrounds",
+            "no moving camera has pictures to look at",
+            "state their `video`, or leave it out",
+            code="no-pictures",
+        )
+    refuse_changed_pictures(folder, description, names)
+    seen = {name: _blocks_to_follow(folder, description, name, every, span_s) for name in names}
+    recorded = description.recorded
+    inputs = {f"pictures of {name}": recorded[f"pictures of {name}"] for name in names} | {
+        f"frames of {name}": hash_of([[block.first, *block.numbers.tolist()] for block in blocks])
+        for name, blocks in seen.items()
+    }
+    run = session.begin(BACKGROUND, settings={"cameras": names}, inputs=inputs, force=force)
+    if run.finished:
+        return run.record
+    missing = [block for blocks in seen.values() for block in blocks if not run.has_chunk(block.name)]
+    left = sum(len(block.numbers) for block in missing)
+    if left:
+        progress.start("Following backgrounds", left)
+    workers = 1 if left < MIN_FOLLOWED_FOR_PROCESSES else workers
+    shared = SharedSession.at(folder)
+    orders = [(shared, block) for block in missing]
+    with closing(each_part(follow_block, orders, workers=workers, executor=executor)) as found:
+        for number, contents in found:
+            run.chunk(missing[number].name, partial(write_contents, contents))
+            progress.advance(len(missing[number].numbers))
+    counts = {}
+    for name, blocks in seen.items():
+        parts = [run.chunk(block.name, _never) for block in blocks]
+        counts[name] = _assemble_background(run.folder / name, parts)
+    return run.publish(counts={"cameras": counts})
 
-    def __init__(
-        self,
-        session: WritableSession,
-        *,
-        every: int = 1,
-        span_s: tuple[float | None, float | None] = (None, None),
-        force: bool = False,
-    ) -> None:
-        self._folder = session.folder
-        self._description = read_description(session.folder)
-        names = cameras_to_follow(self._description)
-        if not names:
-            raise DataError(
-                "the backgrounds",
-                "no moving camera has pictures to look at",
-                "state their `video`, or leave it out",
-                code="no-pictures",
-            )
-        refuse_changed_pictures(session.folder, self._description, names)
-        self._seen = {name: self._looked_at(name, every, span_s) for name in names}
-        recorded = self._description.recorded
-        inputs = {f"pictures of {name}": recorded[f"pictures of {name}"] for name in names} | {
-            f"frames of {name}": hash_of([[block.first, *block.numbers.tolist()] for block in seen])
-            for name, seen in self._seen.items()
-        }
-        self._at = {(name, block.first): block for name, seen in self._seen.items() for block in seen}
-        self._kept: set[str] = set()
-        self._run = session.begin(BACKGROUND, settings={"cameras": names}, inputs=inputs, force=force)
 
-    def block(self, camera: str, first: int) -> FollowedBlock | None:
-        """Return the block of a camera that begins with row `first`; None if it is not followed any more."""
-        return None if self._run.finished else self._at.get((camera, first))
+def _blocks_to_follow(
+    folder: Path,
+    description: Description,
+    camera: str,
+    every: int,
+    span_s: tuple[float | None, float | None],
+) -> list[FollowedBlock]:
+    """List the blocks of a camera's pictures that are followed."""
+    frames = read_table(folder / "cameras" / camera / "frames.parquet", FRAMES)
+    numbers, t_ns = (frames[name].to_numpy(np.int64) for name in ("frame", "t_ns"))
+    span, step = range(len(numbers)), 1
+    if description.cameras[camera].keypoints is None:  # as the detector looks at them
+        span, step = rows_between(t_ns - description.start_ns, *span_s), every
+    rows = np.arange(span.start, span.stop)
+    rows = rows[rows % step == 0]
+    rows = rows[rows_to_follow(t_ns[rows])]
+    stills = np.empty(0, np.int64)
+    if len(rows):
+        evenly = round((t_ns[rows[-1]] - t_ns[rows[0]]) / 1e9 / TIME_BETWEEN_STILLS_S) + 1
+        chosen = np.linspace(0, len(rows) - 1, min(evenly, MAX_STILLS, len(rows)))
+        stills = rows[np.round(chosen).astype(np.int64)]
+    blocks = []
+    for first in span[::BLOCK]:
+        begin, end = np.searchsorted(rows, (first, min(first + BLOCK, span.stop))).tolist()
+        own = rows[begin:end]
+        before = int(numbers[rows[begin - 1]]) if begin and len(own) else None
+        blocks.append(
+            FollowedBlock(camera, first, before, numbers[own], numbers[np.intersect1d(own, stills)])
+        )
+    return blocks
 
-    def keep(self, block: FollowedBlock, write: Callable[[Path], None]) -> None:
-        """Store a block whose pictures were all seen; `write` puts its files into a folder."""
-        self._run.chunk(block.name, write)
-        self._kept.add(block.name)
 
-    def finish(
-        self, *, workers: int = 1, executor: Executor | None = None, progress: Progress | None = None
-    ) -> StageRecord:
-        """Follow through the pictures that nobody showed, and publish the stage.
+def _assemble_background(folder: Path, parts: Iterable[Path]) -> dict[str, int]:
+    """Join the parts of a camera; return their counts."""
+    total = {"pictures": 0, "undecoded": 0, "points": 0, "stills": 0}
+    (folder / "stills").mkdir(parents=True)
 
-        Args:
-            workers: the number of processes of this machine; the result does not depend on it.
-            executor: works on the blocks instead of these processes.
-            progress: receives the progress.
+    def tables() -> Iterable[Any]:
+        for part in parts:
+            table = read_table(part / "tracks.parquet", TRACKS)
+            yield table.assign(point=table["point"] + total["points"])
+            for still in sorted(part.glob("*.jpg")):
+                (folder / "stills" / still.name).write_bytes(still.read_bytes())
+            counts: Mapping[str, int] = read_json(part / "counts.json")
+            for name in total:
+                total[name] += counts[name]
 
-        DataError: pictures are gone or not those that were ingested.
-        """
-        progress = progress or Silent()
-        if self._run.finished:
-            return self._run.record
-        blocks = [block for seen in self._seen.values() for block in seen]
-        left = sum(len(block.numbers) for block in blocks if block.name not in self._kept)
-        if left:
-            progress.start("Following backgrounds", left)
-        missing = [block for block in blocks if not self._run.has_chunk(block.name)]
-        workers = 1 if left < MIN_FOLLOWED_FOR_PROCESSES else workers
-        session = SharedSession.at(self._folder)
-        orders = [(session, block) for block in missing]
-        with closing(each_part(follow_block, orders, workers=workers, executor=executor)) as found:
-            for number, contents in found:
-                self.keep(missing[number], partial(write_contents, contents))
-                progress.advance(len(missing[number].numbers))
-        made = {block.name: self._run.chunk(block.name, _never) for block in blocks}
-        counts = {
-            name: self._assemble(name, [made[block.name] for block in seen])
-            for name, seen in self._seen.items()
-        }
-        return self._run.publish(counts={"cameras": counts})
-
-    def _looked_at(
-        self, camera: str, every: int, span_s: tuple[float | None, float | None]
-    ) -> list[FollowedBlock]:
-        """List the blocks of a camera's pictures that are followed."""
-        frames = read_table(self._folder / "cameras" / camera / "frames.parquet", FRAMES)
-        numbers, t_ns = (frames[name].to_numpy(np.int64) for name in ("frame", "t_ns"))
-        span, step = range(len(numbers)), 1
-        if self._description.cameras[camera].keypoints is None:  # as the detector looks at them
-            span, step = rows_between(t_ns - self._description.start_ns, *span_s), every
-        rows = np.arange(span.start, span.stop)
-        rows = rows[rows % step == 0]
-        rows = rows[rows_to_follow(t_ns[rows])]
-        stills = np.empty(0, np.int64)
-        if len(rows):
-            evenly = round((t_ns[rows[-1]] - t_ns[rows[0]]) / 1e9 / TIME_BETWEEN_STILLS_S) + 1
-            chosen = np.linspace(0, len(rows) - 1, min(evenly, MAX_STILLS, len(rows)))
-            stills = rows[np.round(chosen).astype(np.int64)]
-        blocks = []
-        for first in span[::BLOCK]:
-            begin, end = np.searchsorted(rows, (first, min(first + BLOCK, span.stop))).tolist()
-            own = rows[begin:end]
-            before = int(numbers[rows[begin - 1]]) if begin and len(own) else None
-            blocks.append(
-                FollowedBlock(camera, first, before, numbers[own], numbers[np.intersect1d(own, stills)])
-            )
-        return blocks
-
-    def _assemble(self, camera: str, parts: Iterable[Path]) -> dict[str, int]:
-        """Join the parts of a camera; return their counts."""
-        total = {"pictures": 0, "undecoded": 0, "points": 0, "stills": 0}
-        folder = self._run.folder / camera
-        (folder / "stills").mkdir(parents=True)
-
-        def tables() -> Iterable[Any]:
-            for part in parts:
-                table = read_table(part / "tracks.parquet", TRACKS)
-                yield table.assign(point=table["point"] + total["points"])
-                for still in sorted(part.glob("*.jpg")):
-                    (folder / "stills" / still.name).write_bytes(still.read_bytes())
-                counts: Mapping[str, int] = read_json(part / "counts.json")
-                for name in total:
-                    total[name] += counts[name]
-
-        join_tables(tracks_path(folder), tables(), TRACKS)
-        return total
+    join_tables(tracks_path(folder), tables(), TRACKS)
+    return total

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from pipelines.detect import Following, cameras_to_follow, detect, hints_from, hints_of
+from pipelines.detect import cameras_to_follow, detect, follow, hints_from, hints_of
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views
@@ -189,11 +189,8 @@ def reconstruct(
         ingested = session.ingested()
         description = read_description(folder)
         settings = replace(settings, people=settings.people or ("auto" if description.actors else 1))
-        following, left_out = _following(session, description, settings, force)
-        detected = _detected(session, settings, workers, force, following, executor, progress)
-        background = None
-        if following is not None:
-            background, left_out = _finished(following, settings, workers, executor, progress)
+        detected = _detected(session, settings, workers, force, executor, progress)
+        background, left_out = _followed(session, description, settings, workers, force, executor, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
         run = session.begin(
             RECONSTRUCT,
@@ -258,7 +255,6 @@ def _detected(
     settings: ReconstructSettings,
     workers: int,
     force: bool,
-    following: Following | None,
     executor: Executor | None,
     progress: Progress,
 ) -> StageRecord | None:
@@ -272,7 +268,6 @@ def _detected(
         end_s=settings.end_s,
         workers=workers,
         force=force,
-        following=following,
         executor=executor,
         progress=progress,
     )
@@ -333,31 +328,31 @@ def _disturbance_warning(disturbance: PoseDisturbance) -> str:
     )
 
 
-def _following(
-    session: WritableSession, description: Description, settings: ReconstructSettings, force: bool
-) -> tuple[Following | None, str | None]:
-    """Prepare to follow the backgrounds of moving cameras; None, with the reason where `auto` cannot."""
-    if not settings.asks_background or (settings.method == "auto" and not cameras_to_follow(description)):
-        return None, None
-    try:
-        span_s = (settings.start_s, settings.end_s)
-        return Following(session, every=settings.every, span_s=span_s, force=force), None
-    except DataError as error:
-        return None, _reason(error, settings)
-
-
-def _finished(
-    following: Following,
+def _followed(
+    session: WritableSession,
+    description: Description,
     settings: ReconstructSettings,
     workers: int,
+    force: bool,
     executor: Executor | None,
     progress: Progress,
 ) -> tuple[StageRecord | None, str | None]:
-    """Follow what the detector did not show; None with the reason why `auto` goes without backgrounds."""
+    """Follow the backgrounds of moving cameras; None, with the reason where `auto` cannot."""
+    if not settings.asks_background or (settings.method == "auto" and not cameras_to_follow(description)):
+        return None, None
     try:
-        return following.finish(workers=workers, executor=executor, progress=progress), None
+        record = follow(
+            session,
+            every=settings.every,
+            span_s=(settings.start_s, settings.end_s),
+            workers=workers,
+            force=force,
+            executor=executor,
+            progress=progress,
+        )
     except DataError as error:
         return None, _reason(error, settings)
+    return record, None
 
 
 def _reason(error: DataError, settings: ReconstructSettings) -> str:

@@ -25,7 +25,7 @@ from benchmarks.corpus.stored import (
     write_backgrounds,
     write_keypoints,
 )
-from pipelines.detect import Following, detect
+from pipelines.detect import detect, follow
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import tracks_path
 from pipelines.session.stages import StageRecord, locked
@@ -102,7 +102,7 @@ def _detected(session: Path, detector: str, people: int, workers: int) -> StageR
 def _followed(session: Path) -> dict[str, Background]:
     """Follow the background through all pictures of every camera."""
     with locked(session) as writable:
-        record = Following(writable).finish()
+        record = follow(writable)
     backgrounds = {}
     for camera in record.counts["cameras"]:
         folder = session / "background" / camera

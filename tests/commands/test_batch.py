@@ -14,7 +14,7 @@ import pytest
 from pipelines import batch
 from pipelines import detect as detection
 from pipelines.batch import BatchSettings, Job, run_flight
-from pipelines.detect import Following, detect
+from pipelines.detect import detect, follow
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reconstruction import refining
 from pipelines.session.parallel import connected
@@ -50,9 +50,8 @@ def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_clust
 
     def found(folder: Path, *, workers: int = 1, executor: Executor | None = None) -> dict[str, str]:
         with locked(folder) as session:
-            following = Following(session)
-            detect(session, detector=detector, following=following, workers=workers, executor=executor)
-            following.finish(workers=workers, executor=executor)
+            detect(session, detector=detector, workers=workers, executor=executor)
+            follow(session, workers=workers, executor=executor)
         return content(folder)
 
     expected = found(here)
@@ -61,7 +60,7 @@ def test_blocks_of_a_flight_make_the_same_bytes_here_on_processes_and_on_a_clust
         executor = client.get_executor(pure=False)
         assert found(there, executor=executor) == expected
         with locked(apart) as session:  # backgrounds without keypoints
-            Following(session).finish(executor=executor)
+            follow(session, executor=executor)
     assert content(apart / "background") == content(here / "background")
 
 

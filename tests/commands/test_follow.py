@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from pipelines import detect
-from pipelines.detect import Following
+from pipelines.detect import follow
 from pipelines.geometry.arrays import Picture
 from pipelines.reconstruct import reconstruct
 from pipelines.reconstruction.background_tracks import load_stills, load_tracks
@@ -90,7 +90,7 @@ def test_blocks_share_a_picture_and_no_points(session: Path, monkeypatch: pytest
     """Follow in blocks of 15 pictures: points move as the texture does, to some tenths of a pixel."""
     monkeypatch.setattr(detect, "BLOCK", 15)
     with locked(session) as writable:
-        record = Following(writable).finish(workers=2)
+        record = follow(writable, workers=2)
     assert record.counts["cameras"]["drone1"]["pictures"] == FRAMES
     tracks = pd.read_parquet(session / "background" / "drone1" / "tracks.parquet")
     spans = tracks.groupby("point")["frame"].agg(["min", "max"])

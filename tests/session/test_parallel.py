@@ -52,9 +52,7 @@ def test_a_worker_refuses_another_session_another_program_and_other_models(tmp_p
     with refused("wrong-worker", "--scheduler"):
         replace(shared, code="0.0.0").opened()
     detector = find_detector(spot_detector(tmp_path))
-    order = _DetectionOrder(
-        shared, detector, hashes_of_models(detector), True, 1, Block("drone1", 0, 1), None
-    )
+    order = _DetectionOrder(shared, detector, hashes_of_models(detector), True, 1, Block("drone1", 0, 1))
     (tmp_path / "pose.onnx").write_bytes(b"another model")
     with refused("wrong-worker", detector.name):
         detect_block(order)
