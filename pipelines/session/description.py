@@ -10,12 +10,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipelines.geometry.arrays import DistortionModel, Intrinsics, Place
 from pipelines.session.errors import DataError
-from pipelines.session.records import Occupancy
+from pipelines.session.records import HeldMap
 from pipelines.session.storage import hash_of, read_json, refuse_camera_names, refuse_newer
 
 
@@ -216,28 +215,6 @@ class ActorEntry(Entry):
     def hip_above_m(self) -> float:
         """Height of the hips above the logged point, m, for a standing person of 1.75 m."""
         return HIP_ABOVE_POINT_M[self.point]
-
-
-class HeldMap(Entry):
-    """One map with its voxel counts; unknown voxels count neither as occupied nor as free."""
-
-    from_ns: int  # it holds from then on, until the next one does
-    resolution_m: float
-    shape: list[int]
-    occupied: int
-    free: int
-
-    @classmethod
-    def of(cls, occupancy: Occupancy) -> HeldMap:
-        """Return the entry of a map."""
-        occupied, free = occupancy.probability >= 0.5, occupancy.probability < 0.5  # NaN is neither
-        return cls(
-            from_ns=occupancy.from_ns,
-            resolution_m=occupancy.resolution_m,
-            shape=list(occupancy.probability.shape),
-            occupied=int(np.count_nonzero(occupied)),
-            free=int(np.count_nonzero(free)),
-        )
 
 
 class MapEntry(Entry):

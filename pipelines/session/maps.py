@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.session.description import HeldMap
 from pipelines.session.errors import DataError
-from pipelines.session.records import Occupancy
+from pipelines.session.records import HeldMap, Occupancy
 from pipelines.session.storage import as_data_error, jsonable, read_json, refuse_special, write_json
 
 MOST_VOXELS = 200_000_000

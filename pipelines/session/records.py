@@ -292,6 +292,29 @@ class Occupancy:
     crs: str | None = None
 
 
+@dataclass(frozen=True)
+class HeldMap:
+    """A stored map with its voxel counts; unknown voxels count neither as occupied nor as free."""
+
+    from_ns: int  # it holds from then on, until the next one does
+    resolution_m: float
+    shape: list[int]
+    occupied: int
+    free: int
+
+    @classmethod
+    def of(cls, occupancy: Occupancy) -> HeldMap:
+        """Return the entry of a map."""
+        probability = occupancy.probability  # NaN is neither
+        return cls(
+            from_ns=occupancy.from_ns,
+            resolution_m=occupancy.resolution_m,
+            shape=list(probability.shape),
+            occupied=int(np.count_nonzero(probability >= 0.5)),
+            free=int(np.count_nonzero(probability < 0.5)),
+        )
+
+
 # --- drones' own logs ---
 
 Height = Literal["sea level", "ellipsoid", "take-off", "stated", "unknown"]
