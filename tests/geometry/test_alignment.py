@@ -91,12 +91,6 @@ def test_a_batch_is_its_members_and_nan_where_there_is_no_answer() -> None:
             np.testing.assert_allclose(batch.apply(source)[i, j], one.apply(source[i, j]), atol=1e-12)
 
 
-def test_too_few_points_have_no_alignment() -> None:
-    source = cloud(4)
-    source[:2] = np.nan
-    assert np.isnan(align_each(source, cloud(4), with_scale=True).rotation).all()
-
-
 @pytest.mark.parametrize("origin", [0.0, 1000.0])
 @pytest.mark.parametrize("step", [0.0, 0.3])
 def test_points_on_a_line_or_a_spot_have_no_alignment(origin: float, step: float) -> None:

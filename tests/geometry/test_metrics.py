@@ -173,15 +173,6 @@ def test_feet_that_stand_slide_as_far_as_the_estimate_moves_them() -> None:
     assert found["foot_sliding_mm"] == pytest.approx(4 / 0.04 / 30)
 
 
-def test_shapes_and_stamps_must_agree() -> None:
-    with pytest.raises(ValueError, match=r"T, P, J, 3"):
-        measure(walk(6), walk(5), JOINTS, stamps(6))
-    with pytest.raises(ValueError, match=r"T, P, J, 3"):
-        measure(walk(6), walk(6), JOINTS[:4], stamps(6))
-    with pytest.raises(ValueError, match="stamps"):
-        measure(walk(6), walk(6), JOINTS, stamps(6)[::-1])
-
-
 # --- without truth -------------------------------------------------------------------------------------
 
 BONES = (("left_hip", "left_knee"), ("right_hip", "right_knee"), ("left_hip", "right_hip"))

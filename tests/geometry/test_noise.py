@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import (
@@ -144,13 +142,6 @@ def test_latency_shows_where_the_camera_was() -> None:
     np.testing.assert_allclose(sigma, np.tile([0.5, 0.04], (40, 1)))
 
 
-def test_the_same_seed_gives_the_same_log() -> None:
-    log = circling(np.linspace(0, 1, 5))
-    first, second = (disturb(SCATTERED, *log, np.random.default_rng(9)) for _ in range(2))
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
-
-
 # --- from what users write -----------------------------------------------------------------------------
 
 
@@ -194,10 +185,3 @@ def test_the_text_form_becomes_the_same_models() -> None:
 def test_nonsense_is_refused_by_name(name: str, parameters: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build([(name, parameters)], CLASSES)
-
-
-@given(position=st.floats(0, 1e6), rotation=st.floats(0, 360), frame=st.sampled_from(["world", "body"]))
-def test_what_is_written_is_what_is_read(position: float, rotation: float, frame: str) -> None:
-    text = f"bias:position_m={position!r},rotation_deg={rotation!r},frame={frame}"
-    parameters = {"position_m": position, "rotation_deg": rotation, "frame": frame}
-    assert parse(f"{text} + {text}") == [("bias", parameters)] * 2

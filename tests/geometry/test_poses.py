@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import (
-    ENU_FROM_NED,
     compose,
     conjugate,
     gaps,
@@ -102,20 +101,6 @@ def test_chains_of_transforms(p: Float, r: Float, q: Float, s: Float, point: Flo
     )
     np.testing.assert_allclose(
         transform(invert(*world_from_b), transform(world_from_b, point)), point, rtol=0, atol=1e-11
-    )
-
-
-def test_north_east_down_becomes_east_north_up() -> None:
-    matrix = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
-    positions, quaternions = turning(np.linspace(0, 3, 5))
-    enu_positions = rotate(ENU_FROM_NED, positions)
-    enu_quaternions = multiply(ENU_FROM_NED, quaternions)
-    np.testing.assert_allclose(enu_positions, positions @ matrix.T, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(
-        matrix_from_quaternion(enu_quaternions),
-        matrix @ matrix_from_quaternion(quaternions),
-        rtol=0,
-        atol=1e-14,
     )
 
 

@@ -100,39 +100,6 @@ def test_robust_is_as_good_as_least_squares_under_pose_errors(cameras: int, leve
     assert robust <= 1.02 * least_squares
 
 
-def test_dlt_is_the_smallest_singular_vector() -> None:
-    rng = np.random.default_rng(3)
-    _, views = ring(20, 5)
-    views = with_pose_noise(with_pixel_noise(views, rng), rng, "b", constant=True, stated=False)
-    views = replace(views, weight=rng.uniform(0.2, 1.0, views.weight.shape))
-
-    centre = views.position.mean(axis=1, keepdims=True)
-    unit = np.sqrt(((views.position - centre) ** 2).sum(axis=-1).mean(axis=1))[:, None, None]
-    camera_from_world = np.swapaxes(views.rotation, -1, -2)
-    shift = -camera_from_world @ ((views.position - centre) / unit)[..., None]
-    P = np.concatenate([camera_from_world, shift], axis=-1)[views.pose_index]
-    ray = np.concatenate([views.rays, np.ones((*views.weight.shape, 1))], axis=-1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    rows = P - ray[..., None] * np.einsum("nci,ncij->ncj", ray, P)[..., None, :]  # perpendicular to the ray
-    X = np.linalg.svd(rows.reshape(len(rows), -1, 4))[2][:, -1]
-    expected = (X[:, :3] / X[:, 3:]) * unit[views.pose_index, 0] + centre[views.pose_index, 0]
-
-    assert np.abs(triangulate(views, method="dlt").points - expected).max() < 1e-9 * 10  # at 10 m
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_the_worlds_origin_does_not_matter(method: Method) -> None:
-    rng = np.random.default_rng(4)
-    _, views = ring(50, 5)
-    views = with_pose_noise(with_pixel_noise(views, rng), rng, "c", constant=True, stated=True)
-    far = np.array([1000.0, -700.0, 50.0])
-
-    here = triangulate(views, method=method)
-    there = triangulate(replace(views, position=views.position + far), method=method)
-
-    assert np.abs(there.points - far - here.points).max() < 1e-6
-
-
 @pytest.mark.parametrize("noise", ["pixels", "a"])
 @pytest.mark.parametrize("cameras", [2, 5])
 @pytest.mark.parametrize("method", METHODS)
@@ -257,24 +224,6 @@ def test_every_missing_joint_says_why() -> None:
     assert np.isnan(result.residual_px[1:]).all()
     assert not result.inlier[1:].any()
     assert result.views.tolist() == [3, 0, 0, 0, 0, 0]
-
-
-def test_cameras_that_face_each_other_have_no_parallax() -> None:
-    _, views = ring(1, 2)
-    between = views.position.mean(axis=1)
-    facing = np.stack([views.rotation[0, 0], views.rotation[0, 0] * [-1.0, 1.0, -1.0]])
-    forward = facing[:, :, 2]
-    views = replace(
-        views,
-        rays=np.zeros((1, 2, 2)),
-        weight=np.ones((1, 2)),
-        pose_index=np.zeros(1, np.int64),
-        position=(between - 5 * forward)[None],
-        rotation=facing[None],
-    )
-
-    for method in METHODS:
-        assert words(triangulate(views, method=method)) == ["low_parallax"]
 
 
 def test_a_view_from_behind_is_left_out_and_its_residual_is_infinite() -> None:
