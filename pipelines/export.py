@@ -27,7 +27,7 @@ from pipelines.session.description import HIP_ABOVE_POINT_M, Description, Doubt,
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import PlannedArm, Recording
+from pipelines.session.records import MovingBody, PlannedArm, Recording
 from pipelines.session.registries import Export, ExportWithChoices, find_export
 from pipelines.session.stages import StageRecord, open_session, session_name
 from pipelines.session.storage import (
@@ -48,6 +48,7 @@ from pipelines.session.tables import (
     POSES,
     REPLAN,
     SKELETON,
+    load_bodies,
     read_motion,
     read_table,
     trajectory_from,
@@ -202,6 +203,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         gait=lambda: _reconstructed(folder, record, "gait", GAIT),
         planned=lambda: _planned(folder, session.intact_record("replan")),
         place=description.origin.place if description.origin else None,
+        bodies=lambda: _bodies(folder, record),
         doubts=lambda: [doubt.as_warning() for doubt in _doubts(folder, description, record)],
         zero_ns=description.start_ns,
         people=() if motion is None else tuple(description.names_of_people(motion.position.shape[1])),
@@ -218,6 +220,14 @@ def _reconstructed(
     """Return a table of the reconstruction; None if there is none."""
     place = f"reconstruct/{name}.parquet"
     return None if record is None or place not in record.outputs else read_table(folder / place, schema)
+
+
+def _bodies(folder: Path, record: StageRecord | None) -> list[MovingBody]:
+    """Return the bodies of the reconstruction, if it has any."""
+    if record is None or "reconstruct/body.parquet" not in record.outputs:
+        return []
+    place = folder / "reconstruct"
+    return load_bodies(place / "body.parquet", place / "body_shape.parquet")
 
 
 def _doubts(folder: Path, description: Description, record: StageRecord | None) -> list[Doubt]:

@@ -35,7 +35,7 @@ from pipelines.session.description import (
     read_description,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, CameraSources, Manifest, read_flight
+from pipelines.session.manifest import Axes, CameraSources, Manifest, read_flight, shape_file
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import recognise
@@ -45,6 +45,8 @@ from pipelines.session.stages import Run, Stage, StageRecord, locked, note_sourc
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.tables import (
     ACTOR,
+    BODY,
+    BODY_SHAPE,
     CAMERA_POSES,
     PLAN,
     POSES,
@@ -413,6 +415,8 @@ class _FlightReader:
                     poses_dropped[name] = poses.dropped
                     self._notes.append(f"{name}: true poses dropped: {losses(poses.dropped)}")
             write_table(folder / "truth_poses.parquet", pd.concat(tables, ignore_index=True), CAMERA_POSES)
+        if truth.body:
+            self._store_true_bodies(folder, truth.body)
         return TruthEntry(
             joints=list(motion.joints) if motion else [],
             people=motion.position.shape[1] if motion else 0,
@@ -423,6 +427,16 @@ class _FlightReader:
             dropped=dropped,
             poses_dropped=poses_dropped,
         )
+
+    def _store_true_bodies(self, folder: Path, stated: str) -> None:
+        """Write the true bodies of a simulated flight, with places in the session's world."""
+        place = located(self._flight_path.parent, stated)
+        bodies = read_table(place, BODY)
+        centre = bodies[["x", "y", "z"]].to_numpy(np.float64)
+        bodies[["x", "y", "z"]] = self._poses.joints(place, centre, own_axes=False)
+        write_table(folder / "truth_body.parquet", bodies, BODY)
+        shape = located(self._flight_path.parent, shape_file(stated))
+        write_table(folder / "truth_body_shape.parquet", read_table(shape, BODY_SHAPE), BODY_SHAPE)
 
     def _note_truth_missing(self, motion: JointMotion) -> tuple[int, dict[str, int]]:
         """Count the true positions that are missing, and those of them that were dropped; note both."""

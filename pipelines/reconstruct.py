@@ -30,6 +30,14 @@ from pipelines.keypoints.corrections import (
 )
 from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
+from pipelines.reconstruction.bodies import (
+    body_figures,
+    body_parts,
+    fit_bodies,
+    load_true_bodies,
+    shape_rows,
+)
+from pipelines.reconstruction.body_fit import BodyFit
 from pipelines.reconstruction.clocks import (
     MIN_SIGMAS_TO_MOVE,
     OFFSET_TO_FIND_S,
@@ -107,7 +115,16 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of
-from pipelines.session.tables import ANGLES, CAMERA_POSES, GAIT, SKELETON, join_tables, write_table
+from pipelines.session.tables import (
+    ANGLES,
+    BODY,
+    BODY_SHAPE,
+    CAMERA_POSES,
+    GAIT,
+    SKELETON,
+    join_tables,
+    write_table,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -230,7 +247,14 @@ def reconstruct(
         doubts = _doubts(flight, stored)
         _refuse_nothing(folder, stored, doubts)
         gait, walks = gait_of(stored.observations, stored.result)
-        metrics = stored.metrics | {"gait": walks, "doubts": [doubt.as_json() for doubt in doubts]}
+        bodies = fit_bodies(stored.observations, stored.views, stored.result)
+        metrics = stored.metrics | {
+            "gait": walks,
+            "body": body_figures(
+                stored.observations.t_ns, stored.metrics["people"]["names"], bodies, load_true_bodies(folder)
+            ),
+            "doubts": [doubt.as_json() for doubt in doubts],
+        }
         warnings = [
             *(doubt.as_warning() for doubt in doubts),
             *assumptions_as_warnings(description.assumptions),
@@ -241,7 +265,7 @@ def reconstruct(
             every = [metrics, *(attempt.metrics for attempt in attempts)]
             metrics |= {"trials": summary_of_trials(every, disturbance.text, disturbance.seed)}
             warnings.append(_disturbance_warning(disturbance))
-        _write_tables(run.folder, stored, gait)
+        _write_tables(run.folder, stored, gait, bodies)
         metrics = write_figures(run.folder, jsonable(metrics))
         warnings += [*stored.warnings, *_unused_cameras(flight.cameras, stored.result)]
         record = run.publish(counts=_counts(metrics, stored, flight.swaps), warnings=warnings)
@@ -379,12 +403,17 @@ def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> 
     )
 
 
-def _write_tables(folder: Path, attempt: Attempt, gait: pd.DataFrame) -> None:
-    """Write skeleton, angles, gait, and the poses of cameras that are not those of the log."""
+def _write_tables(
+    folder: Path, attempt: Attempt, gait: pd.DataFrame, bodies: Sequence[BodyFit | None]
+) -> None:
+    """Write skeleton, angles, gait, bodies if any, and the poses of cameras that are not those of the log."""
     observations, views, result = attempt.observations, attempt.views, attempt.result
     join_tables(folder / "skeleton.parquet", skeleton_parts(observations, result), SKELETON)
     join_tables(folder / "angles.parquet", angles_parts(observations, views, result), ANGLES)
     write_table(folder / "gait.parquet", gait, GAIT)
+    if any(body is not None for body in bodies):
+        join_tables(folder / "body.parquet", body_parts(observations.t_ns, bodies), BODY)
+        write_table(folder / "body_shape.parquet", shape_rows(bodies), BODY_SHAPE)
     if attempt.poses is not None:
         write_table(folder / "cameras.parquet", attempt.poses, CAMERA_POSES)
 

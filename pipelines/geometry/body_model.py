@@ -1,16 +1,38 @@
-"""The human body: its data, its shape as a few numbers, and its surface in any pose."""
+"""The human body: its data, its shape as twelve numbers, its bones in any pose, and its surface.
+
+Shape. A body of stature s has its vertices and joints at s (mean + sum of shape numbers times modes), in m
+from the pelvis's joint. Four modes are the principal ones of MakeHuman's women and men of three builds; a
+population has a standard deviation of 1 in each. Seven modes make a part of the body longer at the same
+stature; 1 is the standard deviation among people of one stature (`PROPORTIONS`).
+
+Pose. Every bone has a rotation world_from_bone relative to the neutral pose of `geometry.rig`, and the
+pelvis's joint a place. A point that is fixed to bone b lies at root + s sum over bones R_b u_b: the steps
+from joint to joint, each in the frame of its upper bone, and the point's own offset. This is linear in
+rotation matrices and in the shape, which makes all derivatives short.
+"""
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.rig import BONE
+from pipelines.geometry.arrays import Float, Index
+from pipelines.geometry.poses import conjugate, matrix_from_quaternion, multiply
+from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES
+from pipelines.geometry.skinning import (
+    BELOW,
+    HINGE,
+    Skin,
+    Skinning,
+    make_skin,
+    neutral_turns,
+    with_bones_between,
+)
 
 # Order of the arrays in `data/body.npz` (`python tools/body_asset.py` made it, and describes them).
 SEXES = ("female", "male")
@@ -19,13 +41,38 @@ PARTS = ("skin", "lips", "brow", "white", "iris", "cloth")
 # The asset stores places as whole tenths of a millimetre.
 UNIT_M = 1e-4
 
-_ASSET = Path(__file__).parent / "data" / "body.npz"
+_DATA = Path(__file__).parent / "data"
+
+# Sex and build take four modes; the fifth moves a vertex by 2 mm.
+_BUILT_MODES = 4
+PROPORTIONS = {
+    "thigh": 0.04,
+    "shank": 0.04,
+    "upper_arm": 0.03,
+    "forearm": 0.035,
+    "trunk": 0.03,
+    "shoulders": 0.04,
+    "foot": 0.035,
+}
+"""Standard deviations of the relative length of a part among people of one stature. Of ANSUR II (Gordon et
+al. 2014, 6068 people): standard deviations of single lengths times sqrt(1 - r^2), with r the correlation of
+length and stature; the sitting height varies by 1.4 % of the stature, which thigh and shank share."""
+SHAPE = ("stature_m", *(f"build_{k + 1}" for k in range(_BUILT_MODES)), *PROPORTIONS)
+"""Names of the shape numbers."""
+MEAN_SHAPE = np.array([1.70, *np.zeros(len(SHAPE) - 1)])
+"""The mean of adults."""
+SHAPE_SIGMA = np.array([0.10, *np.ones(len(SHAPE) - 1)])
+"""Standard deviations of adults. Of the stature it is that of both sexes at 19 years together in the growth
+reference of the World Health Organization (2007): 1.765 +- 0.073 m and 1.632 +- 0.065 m."""
+
+# Arms hang with this angle from the vertical in the neutral pose, as most bodies' do to clear their hips.
+_LEAN_RAD = np.radians(8.0)
 
 
 @cache
 def body_asset() -> dict[str, NDArray[Any]]:
     """Load the arrays of the asset, by name."""
-    with np.load(_ASSET) as stored:
+    with np.load(_DATA / "body.npz") as stored:
         return {name: stored[name] for name in stored.files}
 
 
@@ -34,3 +81,171 @@ def height_standing(vertices: Float, joint: Float) -> float:
     thigh, shank, foot = (joint[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
     leg = np.linalg.norm(shank - thigh) + np.linalg.norm(foot - shank)
     return float(vertices[:, 2].max() - thigh[2] + leg + foot[2])
+
+
+def skin_weights() -> Float:
+    """Return the weights [V, 22] of the asset's vertices on the bones; rows sum to 1."""
+    asset = body_asset()
+    weights = np.zeros((len(asset["bone"]), len(BONES)))
+    np.put_along_axis(weights, asset["bone"].astype(np.int64), asset["weight"] / 65535.0, axis=1)
+    return weights
+
+
+@dataclass(frozen=True)
+class BodyModel:
+    """A body of any shape, relative to its stature, from the pelvis's joint; K = 11 modes."""
+
+    vertex: Float  # [1 + K, V, 3] at rest: the mean and the modes
+    joint: Float  # [1 + K, 22, 3] at rest
+    quads: Index  # [Q, 4] counterclockwise seen from outside
+    weights: Float  # [V, 22]
+    neutral_from_rest: Float  # [22, 4] quaternions xyzw
+
+    @cached_property
+    def steps(self) -> Float:
+        """Each joint's place relative to its parent's, neutral pose: [1 + K, 22, 3], zero for the root."""
+        turn = matrix_from_quaternion(self.neutral_from_rest)
+        steps = np.zeros_like(self.joint)
+        for name, parent in PARENT.items():
+            if parent is not None:
+                along = self.joint[:, BONE[name]] - self.joint[:, BONE[parent]]
+                steps[:, BONE[name]] = along @ turn[BONE[parent]].T
+        return steps
+
+    @cached_property
+    def _bones_of_vertices(self) -> Skin:
+        return make_skin(np.zeros((len(self.weights), 3)), self.weights)
+
+    @property
+    def moving_names(self) -> tuple[str, ...]:
+        """Names of the moving bones of `geometry.skinning`: the rig's, then those that bend half as far."""
+        return (*BONES, *(f"{BONES[bone]}_half" for bone in BELOW.tolist()))
+
+    def skin(self, shape: Float) -> Skin:
+        """Return the vertices at rest of a shape [12], with their weights on moving bones."""
+        rest = shape[0] * np.tensordot(np.array([1.0, *shape[1:]]), self.vertex, 1)
+        return Skin(rest, self._bones_of_vertices.bone, self._bones_of_vertices.weight)
+
+    def hinges(self, shape: Float) -> Float:
+        """Return the joint of each moving bone at rest: [M, 3] m."""
+        joint: Float = shape[0] * np.tensordot(np.array([1.0, *shape[1:]]), self.joint, 1)
+        return np.asarray(joint[HINGE], np.float64)
+
+    def moving_bones(self, centre: Float, rotation: Float) -> tuple[Float, Float]:
+        """Return world_from_rest quaternions [..., M, 4] and joints [..., M, 3] m of the moving bones.
+
+        Args:
+            centre: [..., 22, 3] m, joints of the bones.
+            rotation: [..., 22, 4] relative to the neutral pose.
+        """
+        return with_bones_between(multiply(rotation, self.neutral_from_rest)), centre[..., HINGE, :]
+
+    def surface(self, shape: Float, root: Float, rotation: Float) -> Float:
+        """Compute the vertices [V, 3] m of a shape [12] in one pose: root [3] m, rotation [22, 4]."""
+        steps = shape[0] * np.tensordot(np.array([1.0, *shape[1:]]), self.steps, 1)
+        joint = shape[0] * np.tensordot(np.array([1.0, *shape[1:]]), self.joint, 1)
+        skinning = Skinning(joint, self.neutral_from_rest, steps)
+        return self.skin(shape).moved(*skinning.transforms(root, rotation))
+
+    def reach(self, bones: Index, offset: Float) -> Float:
+        """Express points that are fixed to bones as vectors of every bone.
+
+        Args:
+            bones: [K] the bone that each point is fixed to.
+            offset: [K, 3] from the bone's joint, neutral axes, relative to the stature.
+
+        Returns:
+            [1 + K modes, K, 22, 3]: with the shape's shares, the vectors u of the module's formula.
+        """
+        found = np.zeros((len(self.joint), len(bones), len(BONES), 3))
+        for k, bone in enumerate(np.asarray(bones).tolist()):
+            found[0, k, bone] = offset[k]
+            name = BONES[bone]
+            while (parent := PARENT[name]) is not None:
+                found[:, k, BONE[parent]] = self.steps[:, BONE[name]]
+                name = parent
+        return found
+
+    def rotations(self, world_from_rest: Float) -> Float:
+        """Return rotations [..., 22, 4] relative to this neutral pose, of bones turned so from rest."""
+        return multiply(world_from_rest, conjugate(self.neutral_from_rest))
+
+
+@cache
+def body_model() -> BodyModel:
+    """Return the body that is fitted: the skin of head and hands, and a suit over the rest of the skin."""
+    asset = body_asset()
+    weights = skin_weights()
+    vertices, joints = _of_stature_one()
+    built, modes = _principal(vertices, joints)
+    count = len(weights)
+    modes += [
+        sigma * _longer(part, built[:count], built[count:], weights) for part, sigma in PROPORTIONS.items()
+    ]
+    whole = np.stack([built, *modes])
+    bare = weights[:, [BONE["head"], BONE["neck"], *(BONE[f"{side}_hand"] for side in SIDES)]].sum(axis=1)
+    shown = (asset["part"] == PARTS.index("cloth")) | (bare > 0.5)
+    quads = asset["quads"][shown[asset["quads"]].all(axis=1)].astype(np.intp)
+    used, corners = np.unique(quads, return_inverse=True)
+    joint = whole[:, count:]
+    turns = neutral_turns(joint[0], _LEAN_RAD)
+    return BodyModel(whole[:, used], joint, corners.reshape(quads.shape), weights[used], turns)
+
+
+def _of_stature_one() -> tuple[Float, Float]:
+    """Return vertices [6, V, 3] and joints [6, 22, 3] of the asset's bodies, stature 1, from the pelvis."""
+    asset = body_asset()
+    vertices = UNIT_M * asset["vertices"].astype(np.float64)
+    vertices[:, 1:] += vertices[:, :1]
+    joints = UNIT_M * asset["joints"].astype(np.float64)
+    vertices, joints = vertices.reshape(-1, *vertices.shape[2:]), joints.reshape(-1, *joints.shape[2:])
+    height = np.array([height_standing(*body) for body in zip(vertices, joints, strict=True)])[:, None, None]
+    pelvis = joints[:, :1]
+    return (vertices - pelvis) / height, (joints - pelvis) / height
+
+
+def _principal(vertices: Float, joints: Float) -> tuple[Float, list[Float]]:
+    """Return mean and first modes [V + 22, 3] of bodies; a body of the sample has rms 1 in each mode."""
+    bodies = np.concatenate([vertices, joints], axis=1)
+    mean = bodies.mean(axis=0)
+    _, size, modes = np.linalg.svd((bodies - mean).reshape(len(bodies), -1), full_matrices=False)
+    scaled = modes * (size / np.sqrt(len(bodies)))[:, None]
+    return mean, [mode.reshape(mean.shape) for mode in scaled[:_BUILT_MODES]]
+
+
+def _longer(part: str, vertices: Float, joint: Float, weights: Float) -> Float:
+    """Return the change [V + 22, 3] of a body whose part becomes longer by its own length, at one stature."""
+    stretch = np.zeros((len(BONES), 3, 3))
+    bones = {"trunk": ("spine", "back", "chest"), "shoulders": ("clavicle",), "foot": ("foot", "toes")}
+    ends = {"thigh": "shank", "shank": "foot", "upper_arm": "forearm", "forearm": "hand"}
+    for name in bones.get(part, (part,)):
+        for side in ("",) if part == "trunk" else SIDES:
+            bone = BONE[f"{side}_{name}" if side else name]
+            axis = {"trunk": np.eye(3)[2], "shoulders": np.eye(3)[1], "foot": np.eye(3)[0]}.get(part)
+            if axis is None:
+                axis = joint[BONE[f"{side}_{ends[name]}"]] - joint[bone]
+            axis = axis / np.linalg.norm(axis)
+            stretch[bone] = np.outer(axis, axis)
+    moved = np.zeros_like(joint)
+    for name, parent in PARENT.items():
+        if parent is not None:
+            above = BONE[parent]
+            moved[BONE[name]] = moved[above] + stretch[above] @ (joint[BONE[name]] - joint[above])
+    away = vertices[:, None] - joint
+    change = np.einsum("vb,vbi->vi", weights, moved + np.einsum("bij,vbj->vbi", stretch, away))
+    step = 1e-3
+    grown = height_standing(vertices + step * change, joint + step * moved)
+    # Heights are from the pelvis here, and the foot's own height stays.
+    growth = (grown - height_standing(vertices, joint)) / step - moved[BONE["left_foot"], 2]
+    return np.concatenate([change - growth * vertices, moved - growth * joint])
+
+
+def shape_of(sex: str, build: str, stature_m: float) -> Float:
+    """Return the shape numbers [12] of a simulated body: its nearest place in the principal modes."""
+    vertices, joints = _of_stature_one()
+    number = SEXES.index(sex) * len(BUILDS) + BUILDS.index(build)
+    bodies = np.concatenate([vertices, joints], axis=1)
+    mean, modes = _principal(vertices, joints)
+    flat = np.stack(modes).reshape(_BUILT_MODES, -1)
+    found = np.linalg.lstsq(flat.T, (bodies[number] - mean).ravel(), rcond=None)[0]
+    return np.array([stature_m, *found, *np.zeros(len(PROPORTIONS))])

@@ -47,6 +47,15 @@ def moving_weights(weights: Float) -> Float:
     return np.concatenate([left, 2 * given], axis=-1)
 
 
+def with_bones_between(turned: Float) -> Float:
+    """Append to quaternions [..., 22, 4] of the rig's bones those of the added ones: [..., M, 4]."""
+    above, below = turned[..., ABOVE, :], turned[..., BELOW, :]
+    same_side = np.sum(above * below, axis=-1, keepdims=True) >= 0
+    between = above + np.where(same_side, below, -below)
+    between /= np.linalg.norm(between, axis=-1, keepdims=True)
+    return np.concatenate([turned, between], axis=-2)
+
+
 @dataclass(frozen=True)
 class Skinning:
     """Bones at rest, their turns to the neutral pose, and the rig's offsets.
@@ -66,11 +75,7 @@ class Skinning:
             rotation: [..., 22, 4] world_from_bone relative to the neutral pose, unit quaternions xyzw.
         """
         turned = multiply(rotation, self.neutral_from_rest)
-        above, below = turned[..., ABOVE, :], turned[..., BELOW, :]
-        same_side = np.sum(above * below, axis=-1, keepdims=True) >= 0
-        between = above + np.where(same_side, below, -below)
-        between /= np.linalg.norm(between, axis=-1, keepdims=True)
-        matrix = matrix_from_quaternion(np.concatenate([turned, between], axis=-2))
+        matrix = matrix_from_quaternion(with_bones_between(turned))
 
         steps = np.einsum(
             "...bij,bj->...bi", matrix_from_quaternion(rotation[..., ABOVE, :]), self.offset[BELOW]

@@ -588,6 +588,13 @@ class TruthSource(OwnAxes, UprightSource, MeasuredSource, DelayedSource, FileSou
     """Frames a second of a file of joints without times; `offset_s` is then the time of frame 0."""
     poses: dict[str, str] = {}
     """Files of true poses by camera."""
+    body: str | None = None
+    """Table of true bodies of a simulated flight, `body.parquet`, beside its `body_shape.parquet`."""
+
+
+def shape_file(body: str) -> str:
+    """Return the file of shapes that stands beside a table of bodies."""
+    return body.removesuffix(".parquet") + "_shape.parquet"
 
 
 class PlanSource(FileSource):
@@ -668,7 +675,9 @@ class Manifest(YamlModel):
             sources += [camera.pose, camera.intrinsics, camera.keypoints, camera.gimbal]
             sources += [camera.frame_times, camera.video]
         named = [source.file for source in sources if source is not None and source.file]
-        named += list(self.truth.poses.values()) if self.truth else []
+        if self.truth:
+            named += list(self.truth.poses.values())
+            named += [self.truth.body, shape_file(self.truth.body)] if self.truth.body else []
         return list(dict.fromkeys(path for name in named for path in self.paths_of(name)))
 
     def paths_of(self, file: str) -> list[str]:

@@ -121,6 +121,17 @@ class PlannedArm:
 
 
 @dataclass(frozen=True)
+class MovingBody:
+    """A person's body whose surface is known at some times, by `geometry.body_model`."""
+
+    person: int
+    t_ns: Int64  # [T]
+    shape: Float  # [12]
+    centre: Float  # [T, 22, 3] m, joints of the bones
+    rotation: Float  # [T, 22, 4] world_from_bone relative to the neutral pose
+
+
+@dataclass(frozen=True)
 class Recording:
     """Everything that an export may need: the skeleton, the cameras that it was made with, and the maps.
 
@@ -145,6 +156,8 @@ class Recording:
     """Rows of `tables.ANGLES`, sorted by time, then person; None without a reconstruction."""
     gait: Callable[[], pd.DataFrame | None] = field(default=lambda: None)
     """Rows of `tables.GAIT`; None without a reconstruction."""
+    bodies: Callable[[], Sequence[MovingBody]] = tuple
+    """The bodies that were fitted to people."""
     doubts: Callable[[], Sequence[str]] = tuple
     """Sentences on what contradicts itself in the flight."""
     planned: Callable[[], Sequence[PlannedArm]] = tuple

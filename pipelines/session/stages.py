@@ -229,6 +229,8 @@ _AT_ROOT = {
         "plan.parquet",
         "truth.parquet",
         "truth_poses.parquet",
+        "truth_body.parquet",
+        "truth_body_shape.parquet",
         "session.json",
     )
 }

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, JointMotion, Trajectory
+from pipelines.session.records import (
+    POINT_COVARIANCE_COLUMNS,
+    Detections,
+    JointMotion,
+    MovingBody,
+    Trajectory,
+)
 from pipelines.session.storage import as_data_error, refuse_special
 
 if TYPE_CHECKING:
@@ -86,6 +92,23 @@ GAIT = pa.schema(
     ]
 )
 """reconstruct/gait.parquet: heel strikes and toe-offs of people who walk, with the place of heel or toe."""
+
+BODY_ROTATION_COLUMNS = ("r00", "r01", "r02", "r11", "r12", "r22")
+"""Upper triangle of the covariance of a bone's rotation, rad^2, of a rotation vector in the world."""
+BODY = pa.schema(
+    [
+        *(_T_NS, _PERSON, ("bone", pa.string()), *_XYZ),
+        *((name, pa.float64()) for name in POINT_COVARIANCE_COLUMNS),
+        *_POSE[3:],
+        *((name, pa.float64()) for name in BODY_ROTATION_COLUMNS),
+    ]
+)
+"""reconstruct/body.parquet: the bones of each person's body: centre of the upper joint, and world_from_bone
+relative to the neutral pose, with covariances, sorted by time, then person; `truth_body.parquet` has the true
+ones."""
+BODY_SHAPE = pa.schema([_PERSON, ("number", pa.string()), ("value", pa.float64()), ("sigma", pa.float64())])
+"""reconstruct/body_shape.parquet: the stature (m) and eleven other numbers of each person's shape, and their
+standard deviations; `truth_body_shape.parquet` has the true ones."""
 
 JOINT_ERRORS = pa.schema(
     [_JOINT, ("figure", pa.string()), *((name, pa.float64()) for name in ("value", "low", "high"))]
@@ -401,6 +424,29 @@ def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = 
     for part in _parts(path, schema):
         _fill_motion(motion, part)
     return motion
+
+
+def load_bodies(bodies_path: Path, shapes_path: Path) -> list[MovingBody]:
+    """Load the bodies of tables of `tables.BODY` and `tables.BODY_SHAPE`, one of each person with rows."""
+    from pipelines.geometry.body_model import SHAPE
+    from pipelines.geometry.rig import BONES
+
+    table, shapes = read_table(bodies_path, BODY), read_table(shapes_path, BODY_SHAPE)
+    bodies = []
+    for person in np.unique(table["person"].to_numpy(np.int64)).tolist():
+        own = table[table["person"] == person]
+        numbers = shapes[shapes["person"] == person].set_index("number")["value"]
+        rows = own.sort_values("t_ns", kind="stable")
+        bodies.append(
+            MovingBody(
+                person,
+                rows["t_ns"].to_numpy(np.int64)[:: len(BONES)],
+                numbers.loc[list(SHAPE)].to_numpy(np.float64),
+                rows[["x", "y", "z"]].to_numpy(np.float64).reshape(-1, len(BONES), 3),
+                rows[["qx", "qy", "qz", "qw"]].to_numpy(np.float64).reshape(-1, len(BONES), 4),
+            )
+        )
+    return bodies
 
 
 def _people_of(table: pd.DataFrame) -> int:

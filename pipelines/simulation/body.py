@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Index
 from pipelines.geometry.body_model import BUILDS, PARTS, SEXES, UNIT_M, body_asset, height_standing
+from pipelines.geometry.poses import multiply
 from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig
 from pipelines.geometry.skinning import (
     Skin,
@@ -413,6 +414,10 @@ class PosablePerson:
         return TriangleSurface(
             self.skin.moved(*self.skinning.transforms(root, rotation)), self.faces, self.colour
         )
+
+    def world_from_rest(self, motion: BodyMotion) -> Float:
+        """Return the turns [T, 22, 4] of the bones from the pose in which the mesh rests."""
+        return multiply(motion.rotation, self.skinning.neutral_from_rest)
 
     def keypoints(self, motion: BodyMotion) -> Float:
         """Compute the keypoints [T, 17, 3] m, world, in the order of `joints`.

@@ -5,16 +5,22 @@ those of ROS 2, their fields plain numbers by name; a stamp is nanoseconds since
 are zero may be left out. Axes are the world's, east-north-up.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.body_model import SHAPE, body_model, shape_of
 from pipelines.geometry.poses import conjugate, pose_covariance_in_body
+from pipelines.geometry.rig import BONES, joint_centres
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.storage import write_json
+from pipelines.session.tables import BODY, BODY_ROTATION_COLUMNS, BODY_SHAPE, write_table
 from pipelines.simulation.flight import (
     SimulatedDrone,
     SimulatedFlight,
@@ -24,6 +30,9 @@ from pipelines.simulation.flight import (
     visible_joints,
 )
 from pipelines.simulation.flying import LEVER_ARM
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # The box of a person detector is about this much larger than the extent of the joints.
 _BOX_MARGIN = 0.15
@@ -110,6 +119,8 @@ def write_truth(folder: Path, flight: SimulatedFlight) -> None:
     numbered = flight.scenario.actors is not None
     joints = [each.joints for each in flight.people]
     write_joints(truth / "joints.csv", stamps, joint_names, joints, numbered=numbered)
+    write_table(truth / "body.parquet", true_bodies(flight), BODY)
+    write_table(truth / "body_shape.parquet", true_shapes(flight), BODY_SHAPE)
     if numbered:
         write_json(truth / "people.json", {"people": [each.name for each in flight.people]})
     for drone in flight.drones:
@@ -123,6 +134,35 @@ def write_truth(folder: Path, flight: SimulatedFlight) -> None:
         write_lines(truth / f"{drone.name}_visible.csv", _visible_lines(flight, drone))
     offsets = {drone.name: drone.clock_offset_s for drone in flight.drones}
     write_json(truth / "clocks.json", {"clock_offsets_s": offsets})
+
+
+def true_bodies(flight: SimulatedFlight) -> pd.DataFrame:
+    """Make the rows of `tables.BODY`, without covariances."""
+    import pandas as pd
+
+    unknown = dict.fromkeys((*POINT_COVARIANCE_COLUMNS, *BODY_ROTATION_COLUMNS), np.nan)
+    tables = []
+    for number, each in enumerate(flight.people):
+        rotation, times = body_model().rotations(each.person.world_from_rest(each.motion)), len(flight.t_ns)
+        table = pd.DataFrame({"t_ns": np.repeat(flight.t_ns + flight.scenario.start_ns, len(BONES))})
+        table = table.assign(person=number, bone=np.tile(np.array(BONES, dtype=object), times), **unknown)
+        table[["x", "y", "z"]] = joint_centres(each.person.rig, each.motion).reshape(-1, 3)
+        table[["qx", "qy", "qz", "qw"]] = rotation.reshape(-1, 4)
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True).sort_values(["t_ns", "person"], kind="stable")
+
+
+def true_shapes(flight: SimulatedFlight) -> pd.DataFrame:
+    """Make the rows of `tables.BODY_SHAPE`, with standard deviations of 0."""
+    import pandas as pd
+
+    looks = [each.look.body for each in flight.people]
+    rows = [
+        (number, name, value, 0.0)
+        for number, look in enumerate(looks)
+        for name, value in zip(SHAPE, shape_of(look.sex, look.build, look.height_m).tolist(), strict=True)
+    ]
+    return pd.DataFrame(rows, columns=["person", "number", "value", "sigma"])
 
 
 def _visible_lines(flight: SimulatedFlight, drone: SimulatedDrone) -> list[str]:
@@ -182,6 +222,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         "truth:",
         "  file: truth/joints.csv",
         f"  poses: {{{poses}}}",
+        "  body: truth/body.parquet",
         "",
     ]
     return "\n".join(lines)

@@ -117,7 +117,14 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(small: Path, tm
     same = {name for name in flights[0] if flights[0][name] == flights[2][name]}
     # What a seed cannot change: the lens, the map, the offsets, and how the files hang together.
     lenses = {"drone1_camera.yaml", "drone2_camera.yaml"}
-    assert same == {*lenses, "flight.yaml", "true_poses.yaml", "site.npz", "truth/clocks.json"}
+    assert same == {
+        *lenses,
+        "flight.yaml",
+        "true_poses.yaml",
+        "site.npz",
+        "truth/clocks.json",
+        "truth/body_shape.parquet",
+    }
 
 
 @pytest.mark.slow

@@ -26,12 +26,12 @@ from pipelines.session.people import bones_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
 
 # Viewers interpolate between key frames of this rate without a visible difference.
-_HZ = 30.0
+KEY_FRAMES_HZ = 30.0
 _JOINT_M, _BONE_M = 0.022, 0.014  # radius of the spheres, half the width of the bars
-_FROM_WORLD = np.array([-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # about x by -90 degrees: z up becomes y up
+FROM_WORLD = np.array([-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # about x by -90 degrees: z up becomes y up
 _AHEAD = np.array([1.0, 0.0, 0.0, 0.0])  # about x by 180 degrees: z forward and y down become -z and y up
 _FLOAT, _UINT16 = 5126, 5123
-_ARRAY_BUFFER, _INDEX_BUFFER = 34962, 34963
+ARRAY_BUFFER, INDEX_BUFFER = 34962, 34963
 _MATERIALS = {"": (0.30, 0.33, 0.36), "left": (0.01, 0.19, 0.46), "right": (0.58, 0.09, 0.01)}  # linear RGB
 # A GLB counts its bytes in 32 bits.
 _LARGEST = (1 << 32) - (1 << 16)
@@ -48,13 +48,13 @@ class GlbExport:
         motion = recording.motion
         if motion is None or np.isnan(motion.position).all():
             raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
-        rows = thinned(motion.t_ns, _HZ)
+        rows = thinned(motion.t_ns, KEY_FRAMES_HZ)
         if len(rows) < len(motion.t_ns):
             recording.progress.note(
-                f"glb: {len(rows)} of {len(motion.t_ns)} moments, at most {_HZ:g} a second"
+                f"glb: {len(rows)} of {len(motion.t_ns)} moments, at most {KEY_FRAMES_HZ:g} a second"
             )
         t_ns = motion.t_ns[rows]
-        asset = _Asset((t_ns - t_ns[0]) / 1e9)
+        asset = GltfAsset((t_ns - t_ns[0]) / 1e9)
         spheres = {side: asset.mesh(*_octahedron(_JOINT_M), side) for side in _MATERIALS}
         bars = {side: asset.mesh(*_bar(_BONE_M), side) for side in _MATERIALS}
         for person in range(motion.position.shape[1]):
@@ -69,7 +69,7 @@ class GlbExport:
 
 
 def _add_person(
-    asset: _Asset,
+    asset: GltfAsset,
     motion: JointMotion,
     rows: Int64,
     person: int,
@@ -83,7 +83,7 @@ def _add_person(
         known = np.isfinite(place[:, j, 0])
         if known.any():
             size = np.repeat(known[:, None], 3, axis=1).astype(np.float64)
-            asset.moving(f"{label}{name}", spheres[_side(name)], translation=_held(place[:, j]), scale=size)
+            asset.moving(f"{label}{name}", spheres[_side(name)], translation=held(place[:, j]), scale=size)
     for start, end in bones_of(joints):
         low, span = place[:, joints.index(start)], place[:, joints.index(end)] - place[:, joints.index(start)]
         length = np.linalg.norm(span, axis=1)
@@ -94,20 +94,20 @@ def _add_person(
             asset.moving(
                 f"{label}{start} to {end}",
                 bars[side],
-                translation=_held(np.where(known[:, None], low, np.nan)),
-                rotation=_turned_to(_held(np.where(known[:, None], span, np.nan))),
+                translation=held(np.where(known[:, None], low, np.nan)),
+                rotation=_turned_to(held(np.where(known[:, None], span, np.nan))),
                 scale=size,
             )
 
 
-def _add_camera(asset: _Asset, name: str, track: Trajectory, lens: Intrinsics, t_ns: Int64) -> None:
+def _add_camera(asset: GltfAsset, name: str, track: Trajectory, lens: Intrinsics, t_ns: Int64) -> None:
     """Add a camera with its poses nearest to the moments."""
     after = np.clip(np.searchsorted(track.t_ns, t_ns), 0, len(track.t_ns) - 1)
     before = np.maximum(after - 1, 0)
     is_before = np.abs(track.t_ns[before] - t_ns) < np.abs(track.t_ns[after] - t_ns)
     nearest = np.where(is_before, before, after)
     x, y, z = track.position[nearest].T
-    turn = multiply(multiply(_FROM_WORLD, track.quaternion_xyzw[nearest]), _AHEAD)
+    turn = multiply(multiply(FROM_WORLD, track.quaternion_xyzw[nearest]), _AHEAD)
     camera = {
         "type": "perspective",
         "perspective": {
@@ -125,7 +125,7 @@ def _side(joint: str) -> str:
     return side if side in _MATERIALS else ""
 
 
-def _held(values: Float) -> Float:
+def held(values: Float) -> Float:
     """Replace missing rows [T, 3] by the last known one, before the first by that; one must be known."""
     known = np.isfinite(values[:, 0])
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
@@ -155,7 +155,7 @@ def _bar(half_m: float) -> tuple[Float, Int64]:
 
 
 @dataclass
-class _Asset:
+class GltfAsset:
     """Parts of a glTF file, and its binary buffer."""
 
     t_s: Float  # [T] of all animations
@@ -164,6 +164,7 @@ class _Asset:
     cameras: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
     views: list[dict[str, Any]] = field(default_factory=list)
+    skins: list[dict[str, Any]] = field(default_factory=list)
     channels: list[dict[str, Any]] = field(default_factory=list)
     samplers: list[dict[str, Any]] = field(default_factory=list)
     buffer: bytearray = field(default_factory=bytearray)
@@ -171,9 +172,12 @@ class _Asset:
     def __post_init__(self) -> None:
         self._time = self.array(self.t_s[:, None], "SCALAR", bounded=True)
 
-    def array(self, values: Any, kind: str, *, target: int | None = None, bounded: bool = False) -> int:
-        """Add an array [N, columns] and return its accessor."""
-        code = "<u2" if target == _INDEX_BUFFER else "<f4"
+    def array(
+        self, values: Any, kind: str, *, target: int | None = None, bounded: bool = False, whole: bool = False
+    ) -> int:
+        """Add an array [N, columns] of floats, or of `whole` numbers and indices; return its accessor."""
+        whole = whole or target == INDEX_BUFFER
+        code = "<u2" if whole else "<f4"
         stored = np.ascontiguousarray(values, dtype=code)
         view = {"buffer": 0, "byteOffset": len(self.buffer), "byteLength": stored.nbytes}
         self.views.append(view | ({} if target is None else {"target": target}))
@@ -181,7 +185,7 @@ class _Asset:
         self.buffer += bytes(-len(self.buffer) % 4)
         accessor = {
             "bufferView": len(self.views) - 1,
-            "componentType": _UINT16 if target == _INDEX_BUFFER else _FLOAT,
+            "componentType": _UINT16 if whole else _FLOAT,
             "count": len(stored),
             "type": kind,
         }
@@ -195,9 +199,9 @@ class _Asset:
         faces = corners[triangles]  # each face has corners of its own, so that no normals are needed
         primitive = {
             "attributes": {
-                "POSITION": self.array(faces.reshape(-1, 3), "VEC3", target=_ARRAY_BUFFER, bounded=True)
+                "POSITION": self.array(faces.reshape(-1, 3), "VEC3", target=ARRAY_BUFFER, bounded=True)
             },
-            "indices": self.array(np.arange(faces.size // 3)[:, None], "SCALAR", target=_INDEX_BUFFER),
+            "indices": self.array(np.arange(faces.size // 3)[:, None], "SCALAR", target=INDEX_BUFFER),
             "material": list(_MATERIALS).index(side),
         }
         self.meshes.append({"primitives": [primitive]})
@@ -234,10 +238,12 @@ class _Asset:
             }
             for side, colour in _MATERIALS.items()
         ]
+        children = {child for node in self.nodes for child in node.get("children", ())}
+        roots = [number for number in range(len(self.nodes)) if number not in children]
         document: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "mocap", "extras": {"zero_ns": str(zero_ns)}},
             "scene": 0,
-            "scenes": [{"name": name, "nodes": list(range(len(self.nodes)))}],
+            "scenes": [{"name": name, "nodes": roots}],
             "nodes": self.nodes,
             "meshes": self.meshes,
             "materials": materials,
@@ -248,6 +254,8 @@ class _Asset:
         }
         if self.cameras:
             document["cameras"] = self.cameras
+        if self.skins:
+            document["skins"] = self.skins
         text = json.dumps(document, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + len(self.buffer)

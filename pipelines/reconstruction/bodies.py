@@ -1,0 +1,205 @@
+"""Bodies of the reconstructed people: fitted to their joints, as tables, and compared with true surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float, Index, Int64
+from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, body_model
+from pipelines.geometry.poses import interpolate_poses
+from pipelines.geometry.rig import BONES
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views
+from pipelines.reconstruction.body_fit import BodyFit, Landmarks, fit_body, landmarks_of
+from pipelines.reconstruction.observations import Observations
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, MovingBody
+from pipelines.session.tables import BODY_ROTATION_COLUMNS, load_bodies
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# The spread of landmarks was measured with two rays at right angles: (1 + 1 + 1/2) / 3.
+TWO_RAYS_VARIANCE = 2.5 / 3
+# Two rays that are parallel to 5 degrees show no depth: 2 * 2 * sin(5 deg)^2 is more.
+_MIN_DETERMINANT = 0.02
+# A joint whose covariance is infinite has this variance per axis.
+_UNKNOWN_M2 = 1e4
+# Surfaces are compared at this many times at most: a surface takes 3 ms.
+_COMPARED_TIMES = 100
+# Between true poses further apart nothing is interpolated.
+_LONGEST_STEP_NS = 200_000_000
+_TIMES_AT_ONCE = 4096
+
+
+def fit_bodies(observations: Observations, views: Views, result: Triangulation) -> list[BodyFit | None]:
+    """Fit a body to each person; an empty list if the landmarks of the skeleton are not known."""
+    found = landmarks_of(observations.joints)
+    if found is None:
+        return []
+    landmarks, columns = found
+    times, people, joints, _ = observations.confidence.shape
+    known = np.isin(result.status, [STATUS.index("ok"), STATUS.index("filled")])
+    place = np.where(known[:, None], result.points, np.nan).reshape(times, people, joints, 3)
+    bodies = []
+    for person in range(people):
+        first_row = (np.arange(times) * people + person) * joints
+        errors = partial(_errors, landmarks, views, result, first_row, columns)
+        bodies.append(fit_body(landmarks, observations.t_ns, place[:, person, columns], errors))
+    return bodies
+
+
+def _errors(
+    landmarks: Landmarks,
+    views: Views,
+    result: Triangulation,
+    first_row: Index,
+    columns: Index,
+    times: Index,
+) -> tuple[Float, Float]:
+    """Divide the covariances of landmarks into their own and a common one, see `body_fit.fit_body`.
+
+    A joint's covariance holds errors of the camera poses, which move all joints of a person together. Its own
+    error is the detector's, which errs by so much of a body in every picture: with unit vectors d along the
+    inliers' rays, the inverse of the sum of I - d d^T times a variance, or the whole where that is smaller.
+    The mean of what is left is common.
+    """
+    start = first_row[times]
+    rows = start[:, None] + columns
+    away = np.nanmean(result.points[rows], axis=1)[:, None] - views.position[views.pose_index[start]]
+    ray = away / np.linalg.norm(away, axis=-1, keepdims=True)
+    across = np.nan_to_num(np.eye(3) - ray[..., None] * ray[..., None, :])  # [N, C, 3, 3]
+    normal = np.einsum("nkc,ncij->nkij", result.inlier[rows].astype(np.float64), across)
+    sure = np.linalg.det(normal) > _MIN_DETERMINANT
+    variance = (MEAN_SHAPE[0] * landmarks.picture_sigma) ** 2 / TWO_RAYS_VARIANCE
+    whole = result.covariance[rows]
+    own = np.linalg.inv(np.where(sure[..., None, None], normal, np.eye(3))) * variance[:, None, None]
+    smaller = sure & ~(np.trace(own, axis1=-2, axis2=-1) > np.trace(whole, axis1=-2, axis2=-1))
+    own = np.where(smaller[..., None, None], own, whole)
+    unknown = ~np.isfinite(own).all(axis=(-1, -2), keepdims=True)
+    return np.where(unknown, _UNKNOWN_M2 * np.eye(3), own), _mean_known(whole - own)
+
+
+def _mean_known(covariance: Float) -> Float:
+    """Return the mean [N, 3, 3] over the finite ones of differences [N, K, 3, 3], without negative parts."""
+    finite = np.asarray(np.isfinite(covariance).all(axis=(-1, -2)))
+    total = np.where(finite[..., None, None], covariance, 0.0).sum(axis=1)
+    mean = total / np.maximum(finite.sum(axis=1), 1)[:, None, None]
+    size, axes = np.linalg.eigh((mean + np.swapaxes(mean, -1, -2)) / 2)
+    found: Float = (axes * np.maximum(size, 0.0)[:, None]) @ np.swapaxes(axes, -1, -2)
+    return found
+
+
+# --- tables --------------------------------------------------------------------------------------------
+
+
+def body_parts(t_ns: Int64, bodies: Sequence[BodyFit | None]) -> Iterator[pd.DataFrame]:
+    """Yield the rows of `tables.BODY` in parts of times, sorted by time, then person."""
+    import pandas as pd
+
+    for start in range(0, len(t_ns), _TIMES_AT_ONCE):
+        parts = [
+            _rows(
+                t_ns, person, body, np.nonzero((body.row >= start) & (body.row < start + _TIMES_AT_ONCE))[0]
+            )
+            for person, body in enumerate(bodies)
+            if body is not None
+        ]
+        if parts:
+            yield pd.concat(parts, ignore_index=True).sort_values(["t_ns", "person"], kind="stable")
+
+
+def _rows(t_ns: Int64, person: int, body: BodyFit, chosen: Int64) -> pd.DataFrame:
+    import pandas as pd
+
+    table = pd.DataFrame(
+        {
+            "t_ns": np.repeat(t_ns[body.row[chosen]], len(BONES)),
+            "person": person,
+            "bone": np.tile(np.array(BONES, dtype=object), len(chosen)),
+        }
+    )
+    upper = np.triu_indices(3)
+    table[["x", "y", "z"]] = body.centre[chosen].reshape(-1, 3)
+    table[list(POINT_COVARIANCE_COLUMNS)] = body.centre_covariance[chosen].reshape(-1, 3, 3)[:, *upper]
+    table[["qx", "qy", "qz", "qw"]] = body.rotation[chosen].reshape(-1, 4)
+    table[list(BODY_ROTATION_COLUMNS)] = body.rotation_covariance[chosen].reshape(-1, 3, 3)[:, *upper]
+    return table
+
+
+def shape_rows(bodies: Sequence[BodyFit | None]) -> pd.DataFrame:
+    """Make the rows of `tables.BODY_SHAPE`."""
+    import pandas as pd
+
+    rows = [
+        (person, name, value, sigma)
+        for person, body in enumerate(bodies)
+        if body is not None
+        for name, value, sigma in zip(
+            SHAPE, body.shape.tolist(), np.sqrt(np.diag(body.shape_covariance)).tolist(), strict=True
+        )
+    ]
+    return pd.DataFrame(rows, columns=["person", "number", "value", "sigma"])
+
+
+# --- figures -------------------------------------------------------------------------------------------
+
+
+def load_true_bodies(folder: Path) -> list[MovingBody]:
+    """Load the true bodies of a simulated flight; an empty list if the session has none."""
+    if not (folder / "truth_body.parquet").is_file():
+        return []
+    return load_bodies(folder / "truth_body.parquet", folder / "truth_body_shape.parquet")
+
+
+def body_figures(
+    t_ns: Int64, names: Sequence[str], bodies: Sequence[BodyFit | None], truth: Sequence[MovingBody]
+) -> dict[str, Any]:
+    """Compute the stature of each person, and with true surfaces the errors of vertices and joint centres.
+
+    MPVPE is the mean distance of vertices, in mm; root-relative after the pelvis's joints were subtracted.
+    """
+    figures: dict[str, Any] = {}
+    for name, body in zip(names, bodies, strict=False):
+        if body is None:
+            figures[name] = None
+            continue
+        figures[name] = {
+            "stature_m": float(body.shape[0]),
+            "stature_sigma_m": float(np.sqrt(body.shape_covariance[0, 0])),
+        }
+        if truth:
+            errors = [_surface_errors(t_ns, body, each) for each in truth]
+            figures[name] |= min(errors, key=lambda error: error["mpvpe_mm"] or np.inf)
+    return figures
+
+
+def _surface_errors(t_ns: Int64, body: BodyFit, truth: MovingBody) -> dict[str, float | None]:
+    model = body_model()
+    chosen = np.unique(np.linspace(0, len(body.row) - 1, _COMPARED_TIMES).astype(np.int64))
+    true = [
+        interpolate_poses(
+            truth.t_ns,
+            truth.centre[:, bone],
+            truth.rotation[:, bone],
+            t_ns[body.row[chosen]],
+            max_gap_ns=_LONGEST_STEP_NS,
+            max_extrapolation_ns=0,
+        )
+        for bone in range(len(BONES))
+    ]
+    centre, rotation = (np.stack([each[part] for each in true], axis=1) for part in range(2))
+    whole, relative = [], []
+    for k, row in enumerate(chosen.tolist()):
+        if np.isfinite(centre[k]).all():
+            own = model.surface(body.shape, body.centre[row, 0], body.rotation[row])
+            error = own - model.surface(truth.shape, centre[k, 0], rotation[k])
+            whole.append(np.linalg.norm(error, axis=1).mean())
+            error -= body.centre[row, 0] - centre[k, 0]
+            relative.append(np.linalg.norm(error, axis=1).mean())
+    if not whole:
+        return {"mpvpe_mm": None, "root_mpvpe_mm": None}
+    return {"mpvpe_mm": 1e3 * float(np.mean(whole)), "root_mpvpe_mm": 1e3 * float(np.mean(relative))}

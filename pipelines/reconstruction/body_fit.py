@@ -1,0 +1,575 @@
+"""Fit of the body (`geometry.body_model`) to the joints of one person.
+
+Landmarks are a detector's keypoints as points that are fixed to a bone (`data/landmarks.csv`, made by
+`tools/body_landmarks.py`). How far a landmark of one body lies from its place in the table is constant over a
+flight and unknown: such offsets are estimated with the shape, with the table's spread as prior. So shape and
+pose do not seem surer than landmarks are.
+
+The fit is a maximum a posteriori estimate: joints with their covariances and the spread of landmarks between
+pictures, bounded (Cauchy); a prior of the shape; and the range of every joint, as a wide normal distribution
+and a steep bound (`_RANGES_DEG`). Shape and offsets are determined from moments that are so far apart that
+errors of the detector have changed; then each moment's pose is fitted by itself, since joints of the estimate
+are smooth already. Every step is Gauss-Newton with the derivatives of world rotations R <- exp(d) R.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float, Index, Int64
+from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE_SIGMA, BodyModel, body_model
+from pipelines.geometry.poses import (
+    cross_matrix,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+)
+from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES
+
+_TABLE = Path(__file__).parent / "data" / "landmarks.csv"
+
+# The trunk's joints give the first pose; with fewer other joints, limbs would be of the prior alone.
+_TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+MIN_LANDMARKS = 10
+# A detector's errors have an autocorrelation of 0.1 after this time on the tuning flights.
+_INDEPENDENT_S = 0.4
+# Correlation of the offsets of a face's, a hand's or a foot's landmarks on the tuning flights.
+_ALIKE_IN_A_GROUP = 0.85
+# More moments hardly make the shape surer, because offsets of landmarks stay.
+_MOST_MOMENTS = 200
+# Poses of so many moments at once take 100 MB.
+_BLOCK = 256
+_SHAPE_STEPS, _POSE_STEPS = 12, 6
+# A landmark this many standard deviations off has half its weight.
+_CAUCHY = 3.0
+# A joint beyond its range is held back as if by a measurement this good.
+_BOUND_RAD = np.radians(5.0)
+# A range is taken as two standard deviations to both sides of the usual posture.
+_USUAL_SHARE = 0.5
+# A relaxed arm bends its elbow by so much, degrees.
+_USUAL_ELBOW_DEG = -20.0
+# A longer step leaves the range of the linear model.
+_LONGEST_STEP_RAD = 0.5
+
+_RANGES_DEG: dict[str, tuple[tuple[float, float], ...]] = {
+    "spine": ((-12, 12), (-10, 30), (-15, 15)),
+    "back": ((-12, 12), (-10, 30), (-15, 15)),
+    "chest": ((-12, 12), (-10, 30), (-15, 15)),
+    "neck": ((-23, 23), (-25, 25), (-35, 35)),
+    "head": ((-23, 23), (-25, 25), (-35, 35)),
+    "clavicle": ((-10, 40), (-10, 10), (-20, 20)),
+    "upper_arm": ((-30, 150), (-180, 60), (-90, 90)),
+    "forearm": ((-8, 8), (-150, 0), (-80, 80)),
+    "hand": ((-70, 80), (-70, 80), (-10, 10)),
+    "thigh": ((-30, 45), (-120, 30), (-45, 45)),
+    "shank": ((-5, 5), (0, 150), (-15, 15)),
+    "foot": ((-20, 20), (-20, 50), (-20, 20)),
+    "toes": ((-3, 3), (-70, 45), (-3, 3)),
+}
+"""Rotation of a left bone against its parent about x (forward), y (left) and z (up), degrees from the
+neutral pose. American Academy of Orthopaedic Surgeons (1965): thoracolumbar 80/25, 35 and 45 deg and cervical
+45/45, 45 and 60 deg, each divided among its bones; right limbs are mirrored."""
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Keypoints as points of the body, K of them."""
+
+    joints: tuple[str, ...]
+    bone: Index  # [K]
+    offset: Float  # [K, 3] from the bone's joint, neutral axes, relative to the stature
+    body_sigma: Float  # [K] spread of the offset between bodies, relative to the stature
+    picture_sigma: Float  # [K] spread within a flight, relative to the stature
+
+
+@cache
+def _tables() -> dict[str, Landmarks]:
+    """Read the landmarks of every kind of detector."""
+    import pandas as pd
+
+    found = {}
+    for kind, rows in pd.read_csv(_TABLE, comment="#").groupby("detector"):
+        found[str(kind)] = Landmarks(
+            tuple(rows["joint"]),
+            np.array([BONE[name] for name in rows["bone"]]),
+            rows[["x", "y", "z"]].to_numpy(np.float64),
+            rows["body_sigma"].to_numpy(np.float64),
+            rows["picture_sigma"].to_numpy(np.float64),
+        )
+    return found
+
+
+def landmarks_of(joints: Sequence[str]) -> tuple[Landmarks, Index] | None:
+    """Return the landmarks among a skeleton's joints and their columns; None if there are too few.
+
+    Mouth corners tell BlazePose; every other skeleton has the places of COCO's annotators.
+    """
+    table = _tables()["blazepose" if "left_mouth" in joints else "coco"]
+    kept = np.array([k for k, name in enumerate(table.joints) if name in joints], dtype=np.intp)
+    names = [table.joints[k] for k in kept.tolist()]
+    if len(kept) < MIN_LANDMARKS or not set(_TRUNK).issubset(names):
+        return None
+    columns = np.array([list(joints).index(name) for name in names], dtype=np.intp)
+    chosen = Landmarks(
+        tuple(names), table.bone[kept], table.offset[kept], table.body_sigma[kept], table.picture_sigma[kept]
+    )
+    return chosen, columns
+
+
+@dataclass(frozen=True)
+class BodyFit:
+    """One person's body over a flight."""
+
+    shape: Float  # [12] `body_model.SHAPE`
+    shape_covariance: Float  # [12, 12]
+    row: Index  # [N] the times that have a pose, ascending
+    rotation: Float  # [N, 22, 4] world_from_bone relative to the neutral pose
+    rotation_covariance: Float  # [N, 22, 3, 3] rad^2, of a rotation vector in the world
+    centre: Float  # [N, 22, 3] m, joints of the bones, the pelvis's first
+    centre_covariance: Float  # [N, 22, 3, 3] m^2
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """Unknowns that all moments share, G = 12 + 3 K: the shape, and offsets [K, 3] from the table."""
+
+    shape: Float
+    offset: Float
+
+    @property
+    def deviation(self) -> Float:
+        """The difference [G] from the mean of the prior."""
+        return np.concatenate([self.shape - MEAN_SHAPE, self.offset.ravel()])
+
+    def moved(self, step: Float) -> _Shared:
+        return _Shared(self.shape + step[:12], self.offset + step[12:].reshape(-1, 3))
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Unknowns of every moment, D = 3 + 66: the root [N, 3] and world rotations [N, 22, 3, 3]."""
+
+    root: Float
+    turn: Float
+
+    def moved(self, step: Float) -> _Poses:
+        vector = step[:, 3:].reshape(-1, len(BONES), 3)
+        size = np.linalg.norm(vector, axis=-1, keepdims=True)
+        vector = vector * np.minimum(1.0, _LONGEST_STEP_RAD / np.maximum(size, 1e-12))
+        step_turn = matrix_from_quaternion(quaternion_from_rotation_vector(vector))
+        return _Poses(self.root + step[:, :3], step_turn @ self.turn)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Landmarks of N moments: places [N, K, 3] m, 0 where missing, and roots of weights [N, K, 3, 3]."""
+
+    place: Float
+    root_weight: Float  # L^T of the inverse covariance L L^T; 0 where missing
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations: of poses [N, D, D], of shared unknowns [G, G] and between; and minus gradients."""
+
+    cost: Float  # [N]
+    pose: Float
+    pose_right: Float
+    shared: Float
+    shared_right: Float
+    between: Float  # [N, D, G]
+
+
+def fit_body(
+    landmarks: Landmarks, t_ns: Int64, place: Float, errors: Callable[[Index], tuple[Float, Float]]
+) -> BodyFit | None:
+    """Fit the body to one person's landmarks.
+
+    Args:
+        landmarks: K of them.
+        t_ns: [T] increasing.
+        place: [T, K, 3] m, NaN where missing.
+        errors: gives for N of the times the covariances of each landmark's own error, [N, K, 3, 3] m^2, and
+            of the error that all landmarks of a time share, [N, 3, 3] m^2.
+
+    Returns:
+        The body at all times with both hips, both shoulders and ten landmarks; None if there is none.
+    """
+    known = np.asarray(np.isfinite(place).all(axis=-1))
+    trunk = [landmarks.joints.index(name) for name in _TRUNK]
+    (row,) = np.nonzero(known[:, trunk].all(axis=1) & (known.sum(axis=1) >= MIN_LANDMARKS))
+    if not len(row):
+        return None
+    model = body_model()
+    points = _Points(model, landmarks)
+    chosen = row[_apart(t_ns[row])]
+    first = _first_poses(model, landmarks, place[chosen])
+    shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], errors(chosen)[0]))
+    parts = []
+    for start in range(0, len(row), _BLOCK):
+        rows = row[start : start + _BLOCK]
+        own, common = errors(rows)
+        first, seen = _first_poses(model, landmarks, place[rows]), _seen(place[rows], own)
+        turn, turn_covariance, centre, centre_covariance = _fit_poses(
+            points, first, seen, shared, shared_covariance
+        )
+        quaternion = quaternion_from_matrix(turn)
+        parts.append((quaternion, turn_covariance, centre, centre_covariance + common[:, None]))
+    rotation, rotation_covariance, centre, centre_covariance = (
+        np.concatenate(part) for part in zip(*parts, strict=True)
+    )
+    return BodyFit(
+        shared.shape,
+        shared_covariance[:12, :12],
+        row,
+        rotation,
+        rotation_covariance,
+        centre,
+        centre_covariance,
+    )
+
+
+def _seen(place: Float, covariance: Float) -> _Seen:
+    """Invert the covariances of landmarks [N, K, 3]; a landmark without a place has no weight."""
+    known = np.asarray(np.isfinite(place).all(axis=-1, keepdims=True))
+    inverse = np.linalg.inv(np.where(known[..., None], covariance, np.eye(3)))
+    root = np.swapaxes(np.linalg.cholesky(inverse), -1, -2) * known[..., None]
+    return _Seen(np.where(known, place, 0.0), root)
+
+
+def _apart(t_ns: Int64) -> Index:
+    """Choose moments that are at least `_INDEPENDENT_S` apart, at most `_MOST_MOMENTS` of them."""
+    step_ns = max(_INDEPENDENT_S * 1e9, (t_ns[-1] - t_ns[0]) / _MOST_MOMENTS)
+    _, first = np.unique(((t_ns - t_ns[0]) // step_ns).astype(np.int64), return_index=True)
+    return first
+
+
+# --- equations -----------------------------------------------------------------------------------------
+
+
+class _Points:
+    """Landmarks, and joints of the bones, as functions of pose and shared unknowns."""
+
+    def __init__(self, model: BodyModel, landmarks: Landmarks) -> None:
+        self.bone = landmarks.bone
+        self.reach = model.reach(landmarks.bone, landmarks.offset)  # [1 + 11, K, 22, 3]
+        every = np.arange(len(BONES))
+        self.centres = model.reach(every, np.zeros((len(BONES), 3)))
+        self.precision = _prior_precision(landmarks)  # [G, G] of shared unknowns
+
+    def vectors(self, shared: _Shared) -> Float:
+        """Return the vectors u [K, 22, 3] of the landmarks, relative to the stature."""
+        found: Float = np.tensordot(np.array([1.0, *shared.shape[1:]]), self.reach, 1)
+        found[np.arange(len(self.bone)), self.bone] += shared.offset
+        return found
+
+    def _whitened(
+        self, poses: _Poses, seen: _Seen, shared: _Shared
+    ) -> tuple[Float, Float, Float, Float, Float]:
+        """Return arms R_b u_b [N, K, 22, 3], bounded weights, errors, cost [N] and slopes by poses."""
+        stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
+        arms = np.einsum("nbij,kbj->nkbi", poses.turn, self.vectors(shared), optimize=True)
+        error = seen.place - poses.root[:, None] - stature * arms.sum(axis=2)
+        white = np.einsum("nkij,nkj->nki", seen.root_weight, error)
+        square = np.sum(white**2, axis=-1)
+        bounded = 1 / np.sqrt(1 + square / _CAUCHY**2)[..., None]
+        root = seen.root_weight * bounded[..., None]
+        slope = np.empty((count, many, 3, 1 + len(BONES), 3))
+        slope[:, :, :, 0] = root
+        crossed = -stature * cross_matrix(arms)  # [N, K, 22, 3, 3]
+        slope[:, :, :, 1:] = np.einsum("nkij,nkbjl->nkibl", root, crossed, optimize=True)
+        cost = _CAUCHY**2 * np.log1p(square / _CAUCHY**2).sum(axis=1)
+        return arms, root, white * bounded, cost, slope.reshape(count, 3 * many, -1)
+
+    def normal(self, poses: _Poses, seen: _Seen, shared: _Shared, *, whole: bool) -> _Normal:
+        """Build the normal equations; those of shared unknowns only if `whole`."""
+        stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
+        arms, root, errors, cost, slope = self._whitened(poses, seen, shared)
+        transposed, white = np.swapaxes(slope, 1, 2), errors.reshape(count, -1)
+        pose, right = transposed @ slope, (transposed @ white[..., None])[..., 0]
+        cost = cost + _add_ranges(poses.turn, pose, right)
+        if not whole:
+            empty = np.zeros((0, 0))
+            return _Normal(cost, pose, right, empty, empty, empty)
+
+        turned = poses.turn.transpose(0, 2, 1, 3).reshape(-1, 3 * len(BONES))
+        by_mode = turned @ self.reach[1:].reshape(-1, 3 * len(BONES)).T
+        by_mode = by_mode.reshape(count, 3, -1, many).transpose(0, 3, 1, 2)  # [N, K, 3, 11]
+        by_shape = root @ np.concatenate([arms.sum(axis=2)[..., None], stature * by_mode], axis=-1)
+        by_offset = stature * root @ poses.turn[:, self.bone]
+        by_shared = np.zeros((count, many, 3, 12 + 3 * many))
+        by_shared[..., :12] = by_shape
+        for k in range(many):
+            by_shared[:, k, :, 12 + 3 * k : 15 + 3 * k] = by_offset[:, k]
+        shares = by_shared.reshape(count, 3 * many, -1)
+        flat = shares.reshape(-1, shares.shape[-1])
+        return _Normal(
+            cost,
+            pose,
+            right,
+            flat.T @ flat + self.precision,
+            flat.T @ white.ravel() - self.precision @ shared.deviation,
+            transposed @ shares,
+        )
+
+    def prior_cost(self, shared: _Shared) -> float:
+        """Compute the cost of the shared unknowns."""
+        return float(shared.deviation @ self.precision @ shared.deviation)
+
+
+def _prior_precision(landmarks: Landmarks) -> Float:
+    """Return the inverse prior covariance [G, G] of shape and offsets."""
+    sigma, same = landmarks.body_sigma, landmarks.bone[:, None] == landmarks.bone
+    share = np.where(same & (same.sum(axis=1) > 2), _ALIKE_IN_A_GROUP, 0.0)
+    np.fill_diagonal(share, 1.0)
+    precision = np.zeros((12 + 3 * len(sigma),) * 2)
+    precision[:12, :12] = np.diag(SHAPE_SIGMA**-2)
+    precision[12:, 12:] = np.kron(np.linalg.inv(share * np.outer(sigma, sigma)), np.eye(3))
+    return precision
+
+
+@dataclass(frozen=True)
+class _Ranges:
+    """Ranges of the 21 joints, as rotation vectors of a bone from the middle frame, rad."""
+
+    bone: Index  # [21]
+    parent: Index  # [21]
+    middle: Float  # [21, 3, 3] parent from middle
+    usual: Float  # [21, 3] posture
+    sigma: Float  # [21, 3] of its spread
+    low: Float  # [21, 3]
+    high: Float  # [21, 3]
+
+
+@cache
+def _ranges() -> _Ranges:
+    """Read the table of ranges; only an arm, which turns by 180 degrees, has a middle that is not neutral."""
+    rows = []
+    for name, parent in PARENT.items():
+        if parent is None:
+            continue
+        side, _, part = name.partition("_") if name.partition("_")[0] in SIDES else ("", "", name)
+        low, high = np.radians(_RANGES_DEG[part]).T
+        if side == SIDES[1]:
+            mirror = np.array([-1.0, 1.0, -1.0])
+            low, high = np.minimum(low * mirror, high * mirror), np.maximum(low * mirror, high * mirror)
+        half, middle = (high - low) / 2, (high + low) / 2 * (part == "upper_arm")
+        turn = matrix_from_quaternion(quaternion_from_rotation_vector(middle))
+        usual = -middle + [0.0, np.radians(_USUAL_ELBOW_DEG) * (part == "forearm"), 0.0]
+        limits = low - middle, high - middle
+        rows.append((BONE[name], BONE[parent], turn, usual, _USUAL_SHARE * half, *limits))
+    return _Ranges(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _add_ranges(turn: Float, pose: Float, right: Float) -> Float:
+    """Add the ranges of joints to normal equations, in place; return their cost [N]."""
+    ranges = _ranges()
+    bones, parents, low, high = ranges.bone, ranges.parent, ranges.low, ranges.high
+    frame = turn[:, parents] @ ranges.middle  # world from the middle
+    vector = rotation_vector_from_quaternion(
+        quaternion_from_matrix(np.swapaxes(frame, -1, -2) @ turn[:, bones])
+    )
+    beyond = np.where(vector < low, vector - low, np.where(vector > high, vector - high, 0.0))
+    weight, steep = ranges.sigma**-2, np.where(beyond == 0.0, 0.0, _BOUND_RAD**-2)
+    away = vector - ranges.usual
+    cost = np.sum(weight * away**2 + steep * beyond**2, axis=(1, 2))
+
+    slope = _inverse_left_jacobian(vector) @ np.swapaxes(frame, -1, -2)
+    weighted = np.swapaxes(slope, -1, -2) * (weight + steep)[..., None, :]
+    block = weighted @ slope
+    pull = (np.swapaxes(slope, -1, -2) @ (weight * away + steep * beyond)[..., None])[..., 0]
+    for k, (bone, parent) in enumerate(zip(bones.tolist(), parents.tolist(), strict=True)):
+        one, other = slice(3 + 3 * bone, 6 + 3 * bone), slice(3 + 3 * parent, 6 + 3 * parent)
+        pose[:, one, one] += block[:, k]
+        pose[:, other, other] += block[:, k]
+        pose[:, one, other] -= block[:, k]
+        pose[:, other, one] -= block[:, k]
+        right[:, one] -= pull[:, k]
+        right[:, other] += pull[:, k]
+    return np.asarray(cost)
+
+
+def _inverse_left_jacobian(vector: Float) -> Float:
+    """Return the inverse left Jacobians [..., 3, 3] of rotation vectors [..., 3] (Barfoot 2017, 7.37)."""
+    angle = np.maximum(np.linalg.norm(vector, axis=-1), 1e-6)[..., None, None]
+    across = cross_matrix(vector)
+    share = 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))
+    found: Float = np.eye(3) - across / 2 + share * (across @ across)
+    return found
+
+
+# --- solving -------------------------------------------------------------------------------------------
+
+
+def _fit_shared(points: _Points, poses: _Poses, seen: _Seen) -> tuple[_Shared, Float]:
+    """Fit shape and offsets with the poses of some moments; return them and their covariance [G, G]."""
+    shared = _Shared(MEAN_SHAPE.copy(), np.zeros((len(points.bone), 3)))
+    normal = points.normal(poses, seen, shared, whole=True)
+    cost, damping = normal.cost.sum() + points.prior_cost(shared), 1e-3
+    for _ in range(_SHAPE_STEPS):
+        inverse_between, inverse_right, reduced, reduced_right = _reduced(normal, damping)
+        step = np.asarray(np.linalg.solve(reduced, reduced_right), np.float64)
+        new_shared = shared.moved(step)
+        new_poses = poses.moved(inverse_right - inverse_between @ step)
+        new = points.normal(new_poses, seen, new_shared, whole=True)
+        new_cost = new.cost.sum() + points.prior_cost(new_shared)
+        if new_cost > cost:
+            damping *= 10
+            continue
+        done = cost - new_cost < 1e-3 * len(poses.root)
+        shared, poses, normal, cost, damping = new_shared, new_poses, new, new_cost, damping / 5
+        if done:
+            break
+    _, _, reduced, _ = _reduced(normal, 0.0)
+    return shared, np.asarray(np.linalg.inv(reduced), np.float64)
+
+
+def _reduced(normal: _Normal, damping: float) -> tuple[Float, Float, Float, Float]:
+    """Eliminate the poses; return their answers to shared unknowns and right sides, and what is left."""
+    solved = np.linalg.solve(
+        _damped(normal.pose, np.full(len(normal.pose), damping)),
+        np.concatenate([normal.between, normal.pose_right[..., None]], axis=-1),
+    )
+    answer, right = solved[..., :-1], solved[..., -1]
+    reduced = normal.shared - np.einsum("ndg,ndh->gh", normal.between, answer, optimize=True)
+    reduced_right = normal.shared_right - np.einsum("ndg,nd->g", normal.between, right)
+    return answer, right, reduced, reduced_right
+
+
+def _damped(pose: Float, damping: Float) -> Float:
+    """Return matrices [N, D, D] whose diagonals are larger by a share [N] of their own."""
+    found = pose.copy()
+    diagonal = np.arange(pose.shape[-1])
+    found[:, diagonal, diagonal] *= 1 + damping[:, None]
+    return found
+
+
+def _fit_poses(
+    points: _Points, poses: _Poses, seen: _Seen, shared: _Shared, shared_covariance: Float
+) -> tuple[Float, Float, Float, Float]:
+    """Fit each moment's pose; return rotations and joints of the bones, each with covariances."""
+    normal = points.normal(poses, seen, shared, whole=False)
+    damping = np.full(len(poses.root), 1e-3)
+    for _ in range(_POSE_STEPS):
+        step = np.linalg.solve(_damped(normal.pose, damping), normal.pose_right[..., None])[..., 0]
+        new_poses = poses.moved(np.asarray(step, np.float64))
+        new = points.normal(new_poses, seen, shared, whole=False)
+        better = new.cost <= normal.cost
+        done = bool((normal.cost - new.cost < 0.03)[better].all() and better.all())
+        damping = np.where(better, damping / 5, damping * 10)
+        poses = _Poses(
+            np.where(better[:, None], new_poses.root, poses.root),
+            np.where(better[:, None, None, None], new_poses.turn, poses.turn),
+        )
+        normal = replace(
+            normal,
+            cost=np.where(better, new.cost, normal.cost),
+            pose=np.where(better[:, None, None], new.pose, normal.pose),
+            pose_right=np.where(better[:, None], new.pose_right, normal.pose_right),
+        )
+        if done:
+            break
+    whole = points.normal(poses, seen, shared, whole=True)
+    inverse = np.linalg.inv(whole.pose)
+    answer = -inverse @ whole.between  # of the pose to shared unknowns
+    count = len(poses.root)
+    by_answer = answer[:, 3:].reshape(count, len(BONES), 3, -1)
+    own = inverse[:, 3:, 3:].reshape(count, len(BONES), 3, len(BONES), 3)
+    every = np.arange(len(BONES))
+    rotation_covariance = own[:, every, :, every].transpose(1, 0, 2, 3)
+    rotation_covariance = rotation_covariance + _carried(by_answer, shared_covariance)
+
+    stature, shares = shared.shape[0], np.array([1.0, *shared.shape[1:]])
+    arms = np.einsum("nbij,kbj->nkbi", poses.turn, np.tensordot(shares, points.centres, 1), optimize=True)
+    centre = poses.root[:, None] + stature * arms.sum(axis=2)
+    by_part = np.zeros((count, len(BONES), 3, 1 + len(BONES), 3))
+    by_part[:, :, :, 0] = np.eye(3)
+    by_part[:, :, :, 1:] = np.swapaxes(-stature * cross_matrix(arms), 2, 3)
+    slope = by_part.reshape(count, len(BONES), 3, -1)
+    by_mode = np.einsum("nbij,mkbj->nkim", poses.turn, points.centres[1:], optimize=True)
+    by_shared = np.einsum("nkid,ndg->nkig", slope, answer, optimize=True)
+    by_shared[..., :12] += np.concatenate([arms.sum(axis=2)[..., None], stature * by_mode], axis=-1)
+    white = np.einsum("nkid,nde,nkje->nkij", slope, inverse, slope, optimize=True)
+    return poses.turn, rotation_covariance, centre, white + _carried(by_shared, shared_covariance)
+
+
+def _carried(slope: Float, covariance: Float) -> Float:
+    """Carry the covariance [G, G] of shared unknowns through slopes [N, B, 3, G]."""
+    found: Float = (slope @ covariance) @ np.swapaxes(slope, -1, -2)
+    return found
+
+
+# --- first poses ---------------------------------------------------------------------------------------
+
+
+def _first_poses(model: BodyModel, landmarks: Landmarks, place: Float) -> _Poses:
+    """Turn trunk and limbs the way landmarks [N, K, 3] point; a bone without them as its parent."""
+    missing = np.full_like(place[:, 0], np.nan)
+    of = {name: place[:, k] for k, name in enumerate(landmarks.joints)}
+
+    def at(name: str) -> Float:
+        return of.get(name, missing)
+
+    up = at("left_shoulder") + at("right_shoulder") - at("left_hip") - at("right_hip")
+    z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    pelvis = _turned((y, z), (at("left_hip") - at("right_hip"), up))
+    chest = _turned((z, y), (up, at("left_shoulder") - at("right_shoulder")))
+    turn = np.repeat(chest[:, None], len(BONES), axis=1)
+    turn[:, [BONE["pelvis"], BONE["spine"]]] = pelvis[:, None]
+    ears = (at("left_ear") + at("right_ear")) / 2
+    head = _turned((y, np.array([1.0, 0.0, 0.0])), (at("left_ear") - at("right_ear"), at("nose") - ears))
+    _put(turn, ("head", "neck"), head, chest)
+    steps = model.steps[0]
+    for side in SIDES:
+        for sign, parent, bones, joints in (
+            (-1.0, chest, ("upper_arm", "forearm", "hand"), ("shoulder", "elbow", "wrist")),
+            (1.0, pelvis, ("thigh", "shank", "foot"), ("hip", "knee", "ankle")),
+        ):
+            start, middle, end = (at(f"{side}_{name}") for name in joints)
+            one, two = _unit(middle - start), _unit(end - middle)
+            # Next to straight a hinge shows no axis: then it is the parent's.
+            axis = sign * np.cross(one, two) + 0.1 * parent[..., 1]
+            upper_bone, lower_bone, last = (f"{side}_{name}" for name in bones)
+            upper = _turned((steps[BONE[lower_bone]], y), (one, axis))
+            lower = _turned((steps[BONE[last]], y), (two, axis))
+            _put(turn, (upper_bone,), upper, parent)
+            _put(turn, (lower_bone, last), lower, turn[:, BONE[upper_bone]])
+        forward = at(f"{side}_big_toe") - at(f"{side}_heel")
+        shank = turn[:, BONE[f"{side}_shank"]]
+        foot = _turned((np.array([1.0, 0.0, 0.0]), y), (forward, shank[..., 1]))
+        _put(turn, (f"{side}_foot", f"{side}_toes"), foot, shank)
+    hips = (steps[BONE["left_thigh"]] + steps[BONE["right_thigh"]]) / 2
+    root = (at("left_hip") + at("right_hip")) / 2 - MEAN_SHAPE[0] * pelvis @ hips
+    return _Poses(root, turn)
+
+
+def _put(turn: Float, bones: tuple[str, ...], found: Float, otherwise: Float) -> None:
+    """Set the rotations of some bones where they are known, elsewhere to others."""
+    known = np.asarray(np.isfinite(found).all(axis=(1, 2)))
+    turn[:, [BONE[name] for name in bones]] = np.where(known[:, None, None], found, otherwise)[:, None]
+
+
+def _turned(neutral: tuple[Float, Float], seen: tuple[Float, Float]) -> Float:
+    """Return the rotations [N, 3, 3] from two neutral directions [3] to [N, 3]; the first exactly."""
+    start = _axes(neutral[0][None], neutral[1][None])[0]
+    found: Float = _axes(*seen) @ start.T
+    return found
+
+
+def _axes(first: Float, second: Float) -> Float:
+    x = _unit(first)
+    z = _unit(np.cross(x, second))
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _unit(vector: Float) -> Float:
+    """Scale vectors [..., 3] to length 1; NaN for zero."""
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    found: Float = vector / np.where(length > 1e-9, length, np.nan)
+    return found
