@@ -289,7 +289,8 @@ def _add_points(path: Path, header: Any, voxels: VoxelSet) -> dict[str, int]:
         room = path.stat().st_size - header.offset_to_point_data
         there = max(0, min(stated, room // header.point_format.size))
     try:
-        with laspy.open(path) as cloud:
+        # In one thread: threads of the decompressor do not survive a fork.
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as cloud:
             while read < there and len(chunk := cloud.read_points(min(_CHUNK, there - read))):
                 read += len(chunk)
                 bad = np.isin(np.asarray(chunk.classification), _NOISE)
