@@ -7,9 +7,11 @@ what a store says.
 """
 
 import errno
+import ipaddress
 import os
 import re
 import shutil
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -308,6 +310,8 @@ def _opened(url: str) -> tuple[Any, str]:
     options: dict[str, Any] = {"use_listings_cache": False}
     if scheme == "file":
         options["auto_mkdir"] = True
+    if scheme.startswith("http"):
+        options["get_client"] = _public_client
     try:
         store, path = url_to_fs(url, **options)
     except ImportError as error:
@@ -319,6 +323,29 @@ def _opened(url: str) -> tuple[Any, str]:
     return store, path
 
 
+def is_public(address: str) -> bool:
+    """Return True for an address that belongs to the Internet, not to this machine or a private network."""
+    ip = ipaddress.ip_address(address)
+    return ip.is_global and not ip.is_multicast
+
+
+class _PrivateAddressError(OSError):
+    """A web server that a flight.yaml names is not on the public Internet."""
+
+
+async def _public_client(**options: Any) -> Any:
+    """Make a web client that connects to public addresses alone, also after a redirection."""
+    import aiohttp  # s3fs brings it
+
+    def connect(address: tuple[Any, ...]) -> socket.socket:
+        family, kind, protocol, _, place = address
+        if not is_public(place[0].partition("%")[0]):
+            raise _PrivateAddressError
+        return socket.socket(family, kind, protocol)
+
+    return aiohttp.ClientSession(connector=aiohttp.TCPConnector(socket_factory=connect), **options)
+
+
 def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] | None = None) -> T:
     """Call a function with the store and the path of a URL; an error becomes one line of ours."""
     store, path = _opened(url)
@@ -327,7 +354,12 @@ def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] 
     except MocapError:
         raise
     except Exception as error:
-        names = {type(each).__name__ for each in _chain(error)}
+        chain = list(_chain(error))
+        names = {type(each).__name__ for each in chain}
+        if any(isinstance(each, _PrivateAddressError) for each in chain):
+            problem = "leads to an address of this machine or of a private network"
+            remedy = "fetch the file yourself, and give its path"
+            raise DataError(url, problem, remedy, code="url-refused") from None
         if isinstance(error, OSError) and error.errno in _FULL:
             raise
         if isinstance(error, FileNotFoundError | NotADirectoryError):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
+from pipelines.session import urls
 from pipelines.session.errors import BusyError
 from pipelines.session.urls import fetched, located, matching, put, session_here, source_url, url_of
 from tests.commands.runner import content, mocap, refused, succeeds
@@ -157,6 +160,48 @@ def test_a_url_of_another_kind_or_with_a_secret_is_refused_without_repeating_it(
     flight.settings["cameras"]["drone1"]["keypoints"] = url
     flight.save()
     assert SECRET not in refused("ingest", flight.manifest)
+
+
+class Redirecting(BaseHTTPRequestHandler):
+    """Server of one file, which sends those who ask by its first name to its second."""
+
+    asked: list[str]
+
+    def _answer(self) -> None:
+        self.asked.append(self.headers["Host"])
+        self.send_response(302 if self.path == "/away" else 200)
+        self.send_header("Location", f"http://127.0.0.2:{self.server.server_port}/secret")  # type: ignore[attr-defined]
+        self.send_header("Content-Length", "6")
+        self.end_headers()
+        if self.command == "GET":
+            self.wfile.write(b"secret")
+
+    do_GET = do_HEAD = _answer  # noqa: N815  # the base class's names
+
+    def log_message(self, *arguments: object) -> None:
+        """Stay silent."""
+
+
+def test_nothing_is_fetched_from_private_addresses_nor_by_redirection(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Redirecting.asked = []
+    with ThreadingHTTPServer(("", 0), Redirecting) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        for host in ("127.0.0.1", "localhost", "0.0.0.0"):  # noqa: S104
+            with refusing("url-refused"):
+                fetched(f"http://{host}:{server.server_port}/secret")
+        assert not Redirecting.asked
+        monkeypatch.setattr(urls, "is_public", "127.0.0.1".__eq__)  # stands for a server of the Internet
+        assert fetched(f"http://127.0.0.1:{server.server_port}/secret").read_bytes() == b"secret"
+        with refusing("url-refused"):
+            fetched(f"http://127.0.0.1:{server.server_port}/away")
+        assert all(host.startswith("127.0.0.1") for host in Redirecting.asked)
+        server.shutdown()
+    for address in ("10.0.0.1", "192.168.1.1", "169.254.169.254", "fe80::1", "::1", "::ffff:127.0.0.1"):
+        monkeypatch.undo()
+        assert not urls.is_public(address)
+    assert urls.is_public("93.184.216.34")
 
 
 def test_what_is_no_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

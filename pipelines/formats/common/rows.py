@@ -25,6 +25,7 @@ SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
 
 _UNITS = {"s": SECONDS, "sec": SECONDS, "ms": MILLISECONDS, "us": MICROSECONDS, "ns": NANOSECONDS}
 _STAMP_NAMES = {"t", "time", "timestamp", "stamp"}
+_SPLIT_STAMP = re.compile(r"(?:(?:header_)?(?:t|time|timestamp|stamp)_)?(secs?|nsecs?|nanosecs?)")
 # Stamps are int64, and this is its largest number.
 _LARGEST = 2**63 - 1
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?")
@@ -233,6 +234,7 @@ class Heading:
     stamp: int  # the time's column
     unit: int  # the time's
     names: dict[str, int]  # columns by the names of `cell_name`; the first of each name
+    nanoseconds: int | None = None  # column of the nanoseconds beside whole seconds in the time's column
     unit_stated: bool = True  # False if seconds are only assumed
 
 
@@ -248,23 +250,57 @@ def find_heading(line: str, index: int = 0, delimiters: str = ",;\t") -> Heading
         return None
     name, unit = cell_name(cells[stamp[0]])
     stated = bool(unit) or name not in _STAMP_NAMES or stamp[1] != SECONDS
-    return Heading(index, delimiter, len(cells), *stamp, names, stated)
+    return Heading(index, delimiter, len(cells), *stamp, names, _column_of_nanoseconds(cells), stated)
 
 
 def rows_below(
     path: Path, heading: Heading, text: str, columns: dict[str, int], numbers: dict[str, int]
 ) -> TextTable:
-    """Apply `parse_table` to the rows of a text below its heading; the stamps are the text column "stamp"."""
+    """Apply `parse_table` to the rows of a text below its heading; the stamps are the text column "stamp".
+
+    Whole seconds and their nanoseconds in a column of their own become one number.
+    """
     lines = text.split("\n", heading.line + 1)
-    return parse_table(
+    split = {} if heading.nanoseconds is None else {"nanoseconds": heading.nanoseconds}
+    table = parse_table(
         path,
         lines[-1] if len(lines) > heading.line + 1 else "",
         delimiter=heading.delimiter,
         columns=heading.columns,
-        text={"stamp": heading.stamp, **columns},
+        text={"stamp": heading.stamp, **split, **columns},
         numbers=numbers,
         first_line=heading.line + 2,
     )
+    if split:
+        table.text["stamp"] = _joined(table.text["stamp"], table.text.pop("nanoseconds"))
+    return table
+
+
+def _joined(seconds: pa.ChunkedArray, nanoseconds: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Join whole seconds and nanoseconds to decimal seconds; blank where one of them is no whole number."""
+    import pyarrow.compute as pc
+
+    whole, rest = (
+        pc.replace_substring_regex(pc.utf8_trim_whitespace(column), r"\.0*$", "")
+        for column in (seconds, nanoseconds)
+    )
+    valid = pc.and_(pc.match_substring_regex(whole, r"^\d+$"), pc.match_substring_regex(rest, r"^\d{1,9}$"))
+    return pc.if_else(valid, pc.binary_join_element_wise(whole, pc.utf8_lpad(rest, 9, "0"), "."), "")
+
+
+def _column_of_nanoseconds(header: Sequence[str]) -> int | None:
+    """Find the column of nanoseconds that belongs to whole seconds; None if the time has one column."""
+    split = _split_stamp(header)
+    return split[1] if split and _whole_stamp(header) is None else None
+
+
+def _split_stamp(header: Sequence[str]) -> tuple[int, int] | None:
+    """Find columns `sec` and `nanosec` (also secs, nsecs; alone, or behind stamp_ or header_stamp_)."""
+    found: dict[bool, int] = {}
+    for index, cell in enumerate(header):
+        if match := _SPLIT_STAMP.fullmatch(_plain_name(cell)):
+            found.setdefault(match[1].startswith("n"), index)
+    return (found[False], found[True]) if len(found) == 2 else None
 
 
 def _plain_name(cell: str) -> str:
@@ -276,8 +312,17 @@ def stamp_column(header: Sequence[str]) -> tuple[int, int] | None:
     """Find the time column and its unit: t, time, timestamp or stamp, with _ns or [ns] and so on.
 
     A heading without a unit means seconds. If there are several columns, the finest unit is taken. A table of
-    `rostopic echo -p` has `field.header.stamp`, else `%time`, in ns.
+    `rostopic echo -p` has `field.header.stamp`, else `%time`, in ns. Without any of them, `sec` beside
+    `nanosec` counts.
     """
+    if (whole := _whole_stamp(header)) is not None:
+        return whole
+    split = _split_stamp(header)
+    return (split[0], SECONDS) if split else None
+
+
+def _whole_stamp(header: Sequence[str]) -> tuple[int, int] | None:
+    """Find the time in one column, and its unit."""
     if header and header[0].strip() == "%time":
         return next(
             (k for k, cell in enumerate(header) if cell.strip() == "field.header.stamp"), 0

@@ -50,6 +50,11 @@ _SIGNED, _SIGNATURE = 1, 13  # flag in a packet of MAVLink 2, and the bytes of i
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 # Larger stamps do not fit int64 in nanoseconds.
 _LARGEST_US = 2**62
+_LIKE_PACKETS = re.compile(
+    rb"\0[\0-\x0f].{6}[\xfd\xfe]", re.DOTALL
+)  # a clock until 2100, and a packet's first byte
+# Packets must begin within so many bytes of a file with the name of a log.
+_SEARCHED = 64 * 1024
 _FIRST_US, _LAST_US = 946_684_800_000_000, 4_102_444_800_000_000  # the years 2000 and 2100
 # Stamps in microseconds above this count from 1970, others from boot.
 _UNIX_US = 10**15
@@ -77,8 +82,14 @@ class TlogFormat(DroneLog):
     choices: tuple[str, ...] = ("position", "instance", "time")
 
     def recognises(self, path: Path) -> bool:
-        """Return True if it begins with three packets behind plausible times."""
-        return _are_packets(first_bytes(path, 1024), 0)
+        """Return True if it begins with three packets behind plausible times.
+
+        If its name says that it is one, they may stand behind some damage.
+        """
+        if _are_packets(first_bytes(path, 1024), 0):
+            return True
+        head = first_bytes(path, _SEARCHED, suffixes=self.suffixes)
+        return any(_are_packets(head, match.start()) for match in _LIKE_PACKETS.finditer(head))
 
     def vehicles(self, path: Path) -> list[int]:
         """List the numbers of the systems that say where they are; errors as for `read_telemetry`."""

@@ -175,8 +175,8 @@ def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) ->
     if not points.shape[1] or not frames:
         raise damaged(path, "holds no points")
     xyz = np.where(residual < 0, np.nan, points[:3]).transpose(2, 1, 0)
-    if frames > len(xyz):  # the header cannot count them, and ezc3d goes by it
-        raise DataError(path, f"holds {frames} frames, more than {len(xyz)}", "export it in parts")
+    if frames > len(xyz):
+        xyz = np.concatenate([xyz, _beyond(path, contents, len(xyz), frames)])
     labels = _labels(contents, xyz.shape[1])
     unit = unit or metric_unit(_text(contents, "POINT", "UNITS") or "")
     axes = axes or _SCREEN_UP.get(_text(contents, "POINT", "Y_SCREEN") or "", "z-up")
@@ -198,6 +198,23 @@ def _words(contents: Any, name: str) -> int | None:
     # Theia3D writes them as a table of 2 x 1.
     low, high = (int(v) & 0xFFFF for v in [*np.ravel(values).tolist(), 0][:2])
     return low | high << 16
+
+
+def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
+    """Read the frames [T, N, 3] that ezc3d leaves out because the header cannot count them."""
+    points = int(np.shape(contents["data"]["points"])[1])
+    first = _number(contents, "POINT", "DATA_START")
+    scale = _number(contents, "POINT", "SCALE") or 0.0
+    if np.size(contents["data"]["analogs"]) or scale >= 0 or first is None:
+        raise DataError(
+            path, f"holds {frames} frames beside analog channels or in integers", "export it in parts"
+        )
+    start = (int(first) - 1) * _BLOCK + read * points * 16
+    values = np.fromfile(path, "<f4", count=(frames - read) * points * 4, offset=start)
+    if len(values) < (frames - read) * points * 4:
+        raise damaged(path, f"breaks off before the last of its {frames} frames")
+    rows = values.reshape(frames - read, points, 4).astype(np.float64)
+    return np.where(rows[..., 3:] < 0, np.nan, rows[..., :3])
 
 
 def _labels(contents: Any, count: int) -> tuple[str, ...]:

@@ -55,7 +55,7 @@ class FrameTimesFormat:
         if found is None:
             return False
         heading, column = found
-        return heading.columns == 1 + (column is not None)
+        return heading.columns == 1 + (column is not None) + (heading.nanoseconds is not None)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, frame numbers, times, gaps, and losses."""

@@ -105,6 +105,10 @@ class VideoContainer:
     def describe(self, path: Path) -> dict[str, object]:
         """Describe frames, times, rate, gaps, picture size, codec, and losses."""
         index = self.index(path)
+        if index.codec == UNTIMED:
+            picture = f"{index.width} x {index.height} px"
+            dropped = {f"dropped: {cause}": count for cause, count in index.dropped.items()}
+            return {"frames": index.count, "times": "none: a raw stream", "picture": picture, **dropped}
         times = describe_times(index.pts_ns)
         return {
             "frames": index.count,

@@ -81,10 +81,17 @@ def test_ezc3d_reads_unit_axes_rate_labels_and_residuals(tmp_path: Path) -> None
 def test_more_frames_than_the_header_counts(tmp_path: Path) -> None:
     count = 65_600
     position = np.zeros((count, 1, 1, 3))
+    position[:, 0, 0] = np.arange(count)[:, None] * [0.001, 0.002, 0.003]
+    position[65_590] = np.nan
     path = write(tmp_path / "a.c3d", JointMotion(stamps(count), ("nose",), position))
     trial = need("ezc3d", "c3d").c3d(str(path))["parameters"]["TRIAL"]
     assert [int(v) & 0xFFFF for v in trial["ACTUAL_END_FIELD"]["value"]] == [count - 65_536, 1]
-    with refused("data", path, count):  # ezc3d goes by the header
+    back = read(path)  # ezc3d goes by the header
+    assert len(back.t_ns) == count
+    np.testing.assert_allclose(back.position, position, rtol=FLOAT32, atol=0)
+    start = 512 * (need("ezc3d", "c3d").c3d(str(path))["parameters"]["POINT"]["DATA_START"]["value"][0] - 1)
+    path.write_bytes(path.read_bytes()[: start + 16 * 65_590])
+    with refused("damaged", path, 65600):
         read(path)
 
 
