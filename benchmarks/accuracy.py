@@ -1,9 +1,10 @@
-"""Accuracy of the estimate: `python -m benchmarks.accuracy corpus|gimbals|people|detectors [--write]`.
+"""Accuracy of the estimate: `python -m benchmarks.accuracy SUBJECT [--write]`.
 
 - corpus: all methods on 24 rendered flights and the sample, with the real detectors
   (`benchmarks/corpus/README.md`).
 - gimbals: real pictures that move, by virtual gimbals (`benchmarks/gimbals.py`).
 - people: several people, who is found and who is confused (`benchmarks/people.py`).
+- attitudes: attitudes from pictures where logs have places alone (`benchmarks/attitudes.py`).
 - detectors: the detectors on the sample and on a real recording, beside Pose2Sim (`benchmarks/detectors.py`).
 
 corpus: for each draw the errors of the logs are drawn anew. flight.yaml gives their true model, or neither it
@@ -38,7 +39,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from benchmarks import detectors, gimbals, people
+from benchmarks import attitudes, detectors, gimbals, people
 from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
 from benchmarks.results import fixed, keep, markdown_table
@@ -446,6 +447,7 @@ def _mean(outcomes: Sequence[Outcome], name: str) -> float:
 SUBJECTS: dict[str, tuple[Any, Any]] = {
     "corpus": (add_arguments, run),
     "gimbals": (gimbals.add_arguments, gimbals.run),
+    "attitudes": (attitudes.add_arguments, attitudes.run),
     "people": (people.add_arguments, people.run),
     "detectors": (detectors.add_arguments, detectors.run),
 }

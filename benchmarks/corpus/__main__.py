@@ -61,8 +61,8 @@ def make(flight: Flight, films: Path, workers: int = 1, *, again: bool = False) 
     if not missing and not follows:
         return False
     flight.folder.mkdir(parents=True, exist_ok=True)
-    film = _film(flight, films, workers)
-    session = ingest(film / "flight.yaml", films / f"{flight.name}.session").folder
+    filmed = film(flight, films, workers)
+    session = ingest(filmed / "flight.yaml", films / f"{flight.name}.session").folder
     for detector in missing:
         record = _detected(session, detector, len(flight.scenario.people), workers)
         counts = {
@@ -80,7 +80,7 @@ def make(flight: Flight, films: Path, workers: int = 1, *, again: bool = False) 
     return True
 
 
-def _film(flight: Flight, films: Path, workers: int) -> Path:
+def film(flight: Flight, films: Path, workers: int) -> Path:
     """Film the flight, or find its film; the sample's is in the repository."""
     if flight.folder.name == SAMPLE.name:
         return SAMPLE

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -66,6 +67,10 @@ SEED = 1
 MIN_MAPPED_PICTURES = 8
 # If fewer key pictures are in one map, it fell apart, and its largest piece may be a misfit.
 MIN_MAPPED_SHARE = 0.5
+# A focal length is determined if a start that is off by this share leads to the same one.
+OTHER_FOCAL = 1.1
+# Less than this moves attitudes by less than a degree at the border of a picture.
+MAX_FOCAL_DISAGREEMENT = 0.02
 # Attitudes with a larger common error start the estimate outside of its convergence (20 deg: 1 of 2 failed).
 MAX_ATTITUDE_SIGMA_DEG = 10.0
 # Gimbals hold their horizon to this, and so does the mean of a camera on a drone that banks both ways.
@@ -76,6 +81,8 @@ TRIED_TURN_DEG = 15.0
 LOOKING_DOWN_WEIGHT = 0.3
 # Attitudes in a map wander by this between neighbours (sample and rendered flights, 60 key pictures).
 MAP_SIGMA_DEG = 0.05
+# A map bends: with exact places the common error is this (0.13 and 0.15 deg on the sample's two films).
+BENT_MAP_SIGMA_DEG = 0.12
 # An interpolated picture is between key pictures at half the distance that `_bridge_sigma` measures: a smooth
 # motion errs by a quarter, a rough one by half.
 SHARE_OF_DOUBLE_STEP = 1 / 3
@@ -162,6 +169,11 @@ def map_pictures(
 ) -> PictureMap:
     """Map key pictures by their features.
 
+    Args:
+        features: [P] of all key pictures.
+        intrinsics: the lens.
+        refine_focal: its focal length is a guess; it is refined if the pictures determine it, else held.
+
     Raises:
         NoAttitudesError: too few pictures are in one map.
     """
@@ -197,6 +209,8 @@ def map_pictures(
             f"{mapped} of its {len(features)} key pictures are in one map: a camera that stands or only turns"
             " has no parallax, and one that turns fast has pictures that share nothing"
         )
+    if refine_focal and not _determines_focal(model):
+        return map_pictures(features, intrinsics)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda i: i.name)
     poses = [image.cam_from_world().inverse() for image in images]
     refined = next(iter(model.cameras.values())).params[0]
@@ -208,6 +222,22 @@ def map_pictures(
         error_px=float(model.compute_mean_reprojection_error()),
         focal_ratio=float(refined / focal_px),
     )
+
+
+def _determines_focal(model: Any) -> bool:
+    """Test if a bundle adjustment that starts with another focal length comes back to the map's.
+
+    Straight down over flat ground it does not: there focal length and height are one unknown.
+    """
+    import pycolmap
+
+    other = pycolmap.Reconstruction(model)
+    camera = next(iter(other.cameras.values()))
+    focal_px = float(camera.params[0])
+    camera.params = [focal_px * OTHER_FOCAL, *camera.params[1:]]
+    pycolmap.bundle_adjustment(other, pycolmap.BundleAdjustmentOptions(refine_extra_params=False))
+    found_px = float(next(iter(other.cameras.values())).params[0])
+    return abs(found_px / focal_px - 1) < MAX_FOCAL_DISAGREEMENT
 
 
 def _write_features(
@@ -340,7 +370,7 @@ def lay_on_places(
         fit.places(found.position),
         continuous_signs(turned),
         residual_m,
-        common_sigma_rad=float(np.sqrt(np.trace(spread) / 3)),
+        common_sigma_rad=float(np.hypot(np.sqrt(np.trace(spread) / 3), np.radians(BENT_MAP_SIGMA_DEG))),
         picture_sigma_rad=float(np.hypot(np.radians(MAP_SIGMA_DEG), _bridge_sigma(at_ns, turned))),
     )
 

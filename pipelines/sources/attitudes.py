@@ -141,6 +141,16 @@ def turned_by_pictures(
         f" {laid.residual_m:.2g} m from its places; standard deviation {common_deg:.2g} deg of all,"
         f" {picture_deg:.2g} deg of each"
     )
+    if refine_focal:
+        held = found.focal_ratio == 1.0
+        note(
+            f"{name}: its focal length of {intrinsics.fx:.0f} px is assumed, and"
+            + (
+                " its pictures do not determine it: it is held"
+                if held
+                else f" {found.focal_ratio * intrinsics.fx:.0f} px by its pictures"
+            )
+        )
     return TurnedByPictures(
         replace(places, t_ns=frames.t_ns[known], position=position[known], quaternion_xyzw=turned[known]),
         with_focal(intrinsics, found.focal_ratio),

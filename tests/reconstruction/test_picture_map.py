@@ -75,11 +75,10 @@ def test_key_pictures_are_a_fifth_to_half_a_second_apart() -> None:
         assert steps_s.max() < 0.54
 
 
-def test_features_of_points_give_the_map() -> None:
-    """Features are exact to 0.3 px: attitudes relative to each other come out to 0.05 deg."""
+def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m: float) -> list[KeyFeatures]:
+    """Return features of 500 points up to a height, with errors of 0.3 px; `lens` is what is known of it."""
     rng = np.random.default_rng(7)
-    places, turned = flown()
-    world = rng.uniform([-6, -6, 0], [6, 6, 5], (500, 3))
+    world = rng.uniform([-6, -6, 0], [6, 6, height_m], (500, 3))
     descriptors = rng.gamma(0.5, 40, (500, 128))
     features = []
     for pose in zip(places, turned, strict=True):
@@ -87,8 +86,15 @@ def test_features_of_points_give_the_map() -> None:
         seen = (pixels > 0).all(axis=1) & (pixels < [1279, 719]).all(axis=1) & (rng.random(500) < 0.7)
         noisy = descriptors[seen] + rng.normal(0, 4, (int(seen.sum()), 128))
         pixels = pixels[seen] + rng.normal(0, 0.3, (int(seen.sum()), 2))
-        xy = (pixels - [LENS.cx, LENS.cy]) / LENS.fx
+        xy = (pixels - [lens.cx, lens.cy]) / lens.fx
         features.append(KeyFeatures(xy, noisy.clip(0, 255).astype(np.uint8)))
+    return features
+
+
+def test_features_of_points_give_the_map() -> None:
+    """Features are exact to 0.3 px: attitudes relative to each other come out to 0.05 deg."""
+    places, turned = flown()
+    features = features_of_points(places, turned, LENS, 5.0)
     found = map_pictures(features, LENS)
     assert found.key.tolist() == list(range(KEYS))
     laid = lay_on_places(found, T_NS, T_NS, places, CENTIMETRE)
@@ -102,6 +108,20 @@ def test_features_of_points_give_the_map() -> None:
         map_pictures([features[0]] * 12, LENS)
     with pytest.raises(NoAttitudesError):  # pictures without texture
         map_pictures([KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8))] * 12, LENS)
+
+
+def test_a_guessed_focal_length_is_refined_where_pictures_determine_it() -> None:
+    guessed = replace(LENS, fx=900.0, fy=900.0)
+    places, turned = flown()
+    found = map_pictures(features_of_points(places, turned, guessed, 5.0), guessed, refine_focal=True)
+    assert found.focal_ratio == pytest.approx(1000 / 900, abs=0.01)
+
+    # Straight down over flat ground it is held.
+    x_m = np.linspace(-4, 4, KEYS)
+    places = np.stack([x_m, 1.5 * np.sin(x_m), np.full(KEYS, 12.0)], axis=1)
+    turned = look_at(places, places + np.array([0.01, 0.0, -12.0]))
+    found = map_pictures(features_of_points(places, turned, guessed, 0.01), guessed, refine_focal=True)
+    assert found.focal_ratio == 1.0
 
 
 def test_attitudes_are_off_by_what_is_said_of_them() -> None:

@@ -1,0 +1,132 @@
+"""Attitudes from pictures on rendered flights: `python -m benchmarks.accuracy attitudes FOLDER`.
+
+Flights of the corpus are filmed again, and each camera is mapped once, by the same calls as `mocap ingest`
+with `pose.attitude: pictures`. Its true places are then disturbed many times, as two kinds of logs would:
+
+- rtk: white errors of 0.02 m beside a constant one;
+- gps: a Gauss-Markov error of 1.5 m with a correlation time of 100 s, a place a second.
+
+`off` is the median over draws of the root mean square angle between found and true attitudes of key pictures.
+`NEES` is the mean squared common error over its predicted variance: 1 where the standard deviation is right.
+Flights of 6 s move by some metres only, so many are refused with the errors of a satellite receiver.
+Films stay in FOLDER.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.corpus.__main__ import film
+from benchmarks.corpus.stored import flights
+from benchmarks.results import markdown_table
+from pipelines.formats.videos.video import VideoReader
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.noise import Bias, GaussMarkov, NoiseModel, White, disturb, pose_errors
+from pipelines.geometry.poses import (
+    conjugate,
+    interpolate_poses,
+    multiply,
+    rotation_vector_from_quaternion,
+)
+from pipelines.ingest import ingest
+from pipelines.reconstruction.picture_map import (
+    NoAttitudesError,
+    PictureMap,
+    features_of,
+    key_rows,
+    lay_on_places,
+    map_pictures,
+)
+from pipelines.session.description import read_description
+
+TUNED = ("01-walk", "07-jog", "15-two-people", "21-dance", "05-dance")
+KEPT = ("02-jog", "06-turn", "08-walk", "14-dance", "18-stand")
+"""The last of each half hovers."""
+LOGS: dict[str, tuple[list[NoiseModel], float]] = {
+    "rtk": ([White(position_m=0.02), Bias(position_m=0.05)], 0.1),
+    "gps": ([GaussMarkov(position_m=1.5, correlation_s=100)], 1.0),
+}
+"""Errors of places, and the time between two of them, s."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("folder", type=Path, help="for films, outside the repository")
+    parser.add_argument("--kept", action="store_true", help="measure on the flights that are kept aside")
+    parser.add_argument("--flights", nargs="+", help="names, instead of all of that half")
+    parser.add_argument("--draws", type=int, default=20)
+
+
+def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
+    """Film, map, and compare with the truth."""
+    names = options.flights or (KEPT if options.kept else TUNED)
+    heading = ["flight", "camera", "moves m", "mapped", "cpu s"]
+    for log in LOGS:
+        heading += [f"{log} refused", f"{log} off deg", f"{log} NEES"]
+    rows = [row for name in names for row in measured(name, options.folder.resolve(), options.draws)]
+    yield "attitudes-kept" if options.kept else "attitudes-tuned", markdown_table(heading, rows)
+
+
+def measured(name: str, folder: Path, draws: int) -> Iterator[list[str]]:
+    """Measure every camera of a flight."""
+    (flight,) = [each for each in flights() if each.name == name]
+    place = folder / name
+    if not (place / "flight.yaml").is_file():
+        film(flight, folder, workers=1)
+    session = ingest(place / "flight.yaml", folder / f"{name}.session").folder
+    truth = pd.read_parquet(session / "truth_poses.parquet")
+    for camera, entry in read_description(session).cameras.items():
+        frames = pd.read_parquet(session / "cameras" / camera / "frames.parquet")
+        keys = frames.iloc[key_rows(frames["pts_ns"].to_numpy(np.int64))]
+        own = truth[truth["camera"] == camera]
+        t_ns, position = own["t_ns"].to_numpy(np.int64), own[["x", "y", "z"]].to_numpy(np.float64)
+        turned = own[["qx", "qy", "qz", "qw"]].to_numpy(np.float64)
+        row = [name, camera, f"{np.linalg.norm(position[-1] - position[0]):.1f}"]
+        began_s, lens = time.process_time(), entry.intrinsics.intrinsics()
+        try:
+            with VideoReader(place / f"{camera}.mp4") as pictures:
+                read = [pictures.read(int(number)) for number in keys["frame"]]
+            found = map_pictures([features_of(each, lens) for each in read if each is not None], lens)
+        except NoAttitudesError as error:
+            yield [*row, str(error).split(" of ")[0], f"{time.process_time() - began_s:.0f}", *6 * ["-"]]
+            continue
+        row += [f"{len(found.key)} of {len(keys)}", f"{time.process_time() - began_s:.0f}"]
+        key_t_ns = keys["t_ns"].to_numpy(np.int64)
+        for models, step_s in LOGS.values():
+            row += _figures(found, key_t_ns, t_ns, position, turned, models, step_s, draws)
+        yield row
+
+
+def _figures(
+    found: PictureMap,
+    key_t_ns: Int64,
+    t_ns: Int64,
+    position: Float,
+    turned: Float,
+    models: list[NoiseModel],
+    step_s: float,
+    draws: int,
+) -> list[str]:
+    """Lay a map on places with errors drawn anew; return refusals, errors and NEES."""
+    wide = {"max_gap_ns": 10**9, "max_extrapolation_ns": 10**9}
+    true = interpolate_poses(t_ns, position, turned, key_t_ns[found.key], **wide)[1]
+    step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)
+    off, nees, refused = [], [], 0
+    for draw in range(draws):
+        places, _ = disturb(models, t_ns, position, turned, np.random.default_rng([3, draw]))
+        try:
+            laid = lay_on_places(found, key_t_ns, t_ns[::step], places[::step], pose_errors(models))
+        except NoAttitudesError:
+            refused += 1
+            continue
+        apart = rotation_vector_from_quaternion(multiply(laid.quaternion_xyzw, conjugate(true)))
+        off.append(np.degrees(np.sqrt(np.square(apart).sum(axis=1).mean())))
+        nees.append(np.square(apart.mean(axis=0)).sum() / (3 * laid.common_sigma_rad**2))
+    shown = [f"{np.median(off):.2f}", f"{np.mean(nees):.1f}"] if off else ["-", "-"]
+    return [f"{refused} of {draws}", *shown]
