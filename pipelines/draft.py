@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.drafting.found import (
+    ACTOR,
     LAST_POSE_TYPE,
     NED,
     NO_DATE_NS,
@@ -374,6 +375,7 @@ def _described(
         length_ns = int(index.pts_ns[-1])
         about = f"{index.count} frames, {length_ns / 1e9:.6g} s"
         film = FoundFilm("video", *head, about, file, labels, (0, place), frames=index.count)
+        film = replace(film, size=(index.width, index.height))
         made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
         clock = {SHARED_SECONDS: "whole seconds", UNTIMED: "none"}.get(index.codec, "own")
         yield replace(film, length_ns=length_ns, made_ns=made_ns, clock=clock)
@@ -433,9 +435,10 @@ def _drone_log(path: Path, place: NamePlace, format_: TelemetryFormat, instance:
         telemetry = format_.read_telemetry(path, TelemetryChoice(instance=instance))
     except DataError:  # if only heights are missing, reading with a stated height works
         telemetry = format_.read_telemetry(path, TelemetryChoice(altitude=0.0, instance=instance))
-    track, start = telemetry.position, None
+    track, start, focal_35_mm = telemetry.position, None, None
     if path.suffix.lower() == ".srt":
         subtitles = read_subtitles(path)
+        focal_35_mm = subtitles.focal_35_mm()
         start_ns = subtitles.start_ns() if subtitles.are_slow else None
         if start_ns is not None:
             start = VideoStart(start_ns, "by the subtitles' clock, local time taken as UTC", sigma_s=1)
@@ -466,6 +469,7 @@ def _drone_log(path: Path, place: NamePlace, format_: TelemetryFormat, instance:
         height=track.height,
         video_start=start,
         films=tuple(TimeSpan(*film) for film in films),
+        focal_35_mm=focal_35_mm,
     )
 
 
@@ -659,21 +663,26 @@ def _pose_topic(log: Log, topic: Proposal, type_: str, count: int) -> Proposal:
 
 
 def _pairs(log: Log, path: Path, place: NamePlace) -> Iterator[Proposal]:
-    """Yield topics of positions on Earth with the attitudes beside them."""
+    """Yield topics of positions on Earth with the attitudes beside them; alone in a log without attitudes."""
     topics = {topic.name: topic for topic in log.topics if topic.count}
-    for position, attitude in pairs_of(list(topics.values())):
+    pairs: list[tuple[str, str | None]] = [*pairs_of(list(topics.values()))]
+    if not pairs and not any(kind_of(topic) in {"poses", "transforms"} for topic in topics.values()):
+        fixes = (name for name, topic in topics.items() if topic.type in FIXES)
+        pairs = [(name, None) for name in fixes if not is_called(name, ACTOR)]
+    for position, attitude in pairs:
         topic = topics[position]
         span = TimeSpan(topic.first_ns or 0, topic.last_ns or 0)
         yield Proposal(
             "pose",
             path,
             place,
-            f"positions and attitudes, {span}",
-            {"file": path, "topic": position, "attitude": attitude},
+            f"positions and attitudes, {span}" if attitude else f"positions alone, {span}",
+            {"file": path, "topic": position} | ({"attitude": attitude} if attitude else {}),
             ((),),
             (1, 1, LAST_POSE_TYPE, -topic.count, position),
             span,
-            of_body=True,
+            of_body=attitude is not None,
+            unturned=attitude is None,
             by_gps=True,
             topic=position,
             lead_ns=_lead_ns(log, position),

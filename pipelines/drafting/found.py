@@ -270,6 +270,7 @@ class FoundFilm(Proposal):
     """A video file or a folder of pictures."""
 
     frames: int = 0
+    size: tuple[int, int] = (0, 0)  # width and height of the pictures, px
     length_ns: int = 0
     made_ns: int | None = None  # its start or its end, in UTC, by its metadata
     clock: str = "own"  # of pictures in a folder: their seconds, or none
@@ -295,6 +296,7 @@ class FlownPoses(Proposal):
     height: Height = "unknown"
     video_start: VideoStart | None = None  # of the video beside it, or of the one that holds it
     films: tuple[TimeSpan, ...] = ()  # when it says that the camera recorded videos
+    focal_35_mm: float | None = None  # focal length of its camera, as on film 36 mm wide
 
     def film_of(self, film: FoundFilm) -> TimeSpan | None:
         """Return the only recording of about a video's length; None if there is none, or several."""

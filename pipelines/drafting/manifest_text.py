@@ -340,6 +340,10 @@ class _ManifestWriter:
 
     def _intrinsics(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("intrinsics")
+        if choice is None and (guess := _lens_by_subtitles(camera)) is not None:
+            what = "the focal length of its subtitles, which its pictures refine"
+            remark = self.assume(camera, "intrinsics", what)
+            return DraftedKey(guess, [remark], self.others("intrinsics", self.draft.free_intrinsics))
         if choice is None:
             remark = self.miss(camera, "intrinsics", "nothing of that name has them")
             numbers = {"width": 1920, "height": 1080, "fx": 1400, "fy": 1400, "cx": 959.5, "cy": 539.5}
@@ -453,6 +457,27 @@ def _is_turned_by_film(camera: CameraDraft) -> bool:
     choice = camera.choices.get("pose")
     filmed = camera.film is not None and "gimbal" not in camera.choices
     return choice is not None and choice.taken.unturned and filmed
+
+
+def _lens_by_subtitles(camera: CameraDraft) -> dict[str, object] | None:
+    """Guess the lens of a camera whose film is mapped, from the focal length in its subtitles."""
+    choice, film = camera.choices.get("pose"), camera.film
+    if choice is None or film is None or not _is_turned_by_film(camera):
+        return None
+    focal_35_mm = choice.taken.focal_35_mm if isinstance(choice.taken, FlownPoses) else None
+    if focal_35_mm is None:
+        return None
+    width, height = film.size
+    focal_px = round(focal_35_mm / 36 * width, 1)
+    return {
+        "width": width,
+        "height": height,
+        "fx": focal_px,
+        "fy": focal_px,
+        "cx": (width - 1) / 2,
+        "cy": (height - 1) / 2,
+        "assumed": True,
+    }
 
 
 def _settings(candidate: Proposal) -> dict[str, object]:

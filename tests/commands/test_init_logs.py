@@ -260,6 +260,41 @@ def test_each_vehicle_of_a_ground_station_s_log_goes_to_the_camera_of_its_number
     assert np.linalg.norm(apart) > 1
 
 
+def test_subtitles_and_a_film_are_a_whole_flight(tmp_path: Path) -> None:
+    """Places, time and focal length are in the subtitles; the film says how the camera turned."""
+    flight = write_flight(tmp_path / "x", cameras=2, seconds=1.0, clean=True)
+    for k in range(2):
+        path = write_srt(tmp_path / f"DJI_{k}.SRT", drone_of(flight, k), gimbal=False)
+        text = path.read_text(encoding="utf-8").replace("[iso", f"[focal_len : {240 if k else 24.0}] [iso")
+        path.write_text(text, encoding="utf-8")
+        write_video(tmp_path / f"DJI_{k}.mp4", even_ticks(15, step=6000))
+    shutil.rmtree(tmp_path / "x")
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    for k, camera in enumerate(stated["cameras"].values()):
+        assert camera["pose"]["attitude"] == "pictures"
+        assert camera["pose"]["file"] == f"DJI_{k}.SRT"
+        assert not {"gimbal", "mount"} & camera.keys()
+        assert camera["intrinsics"]["fx"] == pytest.approx(24 / 36 * SIZE[0], abs=0.1)
+        assert camera["intrinsics"]["assumed"] is True
+
+
+def test_a_film_turns_the_camera_of_a_log_with_fixes_alone(tmp_path: Path) -> None:
+    entries = [
+        Entry("/fix", "sensor_msgs/msg/NavSatFix", START_NS + k * 10**8, {
+            "header": header(START_NS + k * 10**8, "gps"), "latitude": 47.5 + 1e-6 * k, "longitude": 8.5,
+        })
+        for k in range(20)
+    ]  # fmt: skip
+    write_mcap(tmp_path / "d1.mcap", entries)
+    write_video(tmp_path / "d1.mp4", even_ticks(15, step=6000))
+    write_lens(tmp_path)
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    (camera,) = stated["cameras"].values()
+    assert camera["pose"].items() >= {"file": "d1", "topic": "/fix", "attitude": "pictures"}.items()
+
+
 def test_two_drones_of_dji_get_their_own_flight_records(tmp_path: Path) -> None:
     """Subtitles without gimbal angles name the video; the records, of one hour, have the angles."""
     flight = write_flight(tmp_path / "x", cameras=2, seconds=1.0, clean=True)

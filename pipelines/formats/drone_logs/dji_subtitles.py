@@ -202,6 +202,8 @@ _CLOCK = re.compile(
 )
 # Some Mavic 2 write no display times: a number, then the clock time on a line of its own.
 _UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-./]\d{1,2}[-./]\d{1,2} +\d)")
+# Drones' cameras have focal lengths up to this; larger numbers count tenths.
+MAX_FOCAL_35_MM = 170.0
 # Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # Stamps are int64, which ends in the year 2262.
@@ -233,6 +235,15 @@ class Subtitles:
         """Return the clock time at the video's start, by the first subtitle with a clock; None without."""
         shown = np.flatnonzero(self.has_clock)
         return int(self.clock_ns[shown[0]] - self.media_ns[shown[0]]) if len(shown) else None
+
+    def focal_35_mm(self) -> float | None:
+        """Return the focal length of the last subtitle, as on film 36 mm wide; None without.
+
+        `[focal_len: 24.00]` is in mm, `[focal_len : 280]` in tenths.
+        """
+        found = re.search(r"\[focal_len *: *(\d+(?:\.\d+)?)", self.texts[-1])
+        stated = float(found[1]) if found else 0.0
+        return (stated / 10 if stated > MAX_FOCAL_35_MM else stated) or None
 
     def times(self) -> tuple[Int64, Bool]:
         """Return the time at which each subtitle was written [B], and True if that is known [B].
