@@ -11,9 +11,15 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.reconstruction.doubts.alternatives import NUMBERS, changed
-from pipelines.reconstruction.doubts.body import STATURE_M, stature_m
-from pipelines.reconstruction.doubts.fit import fit, solve
-from pipelines.reconstruction.doubts.scene import JOINTS, MOMENTS, Sampled, SceneOfMoments
+from pipelines.reconstruction.doubts.scene import (
+    JOINTS,
+    MOMENTS,
+    STATURE_M,
+    Sampled,
+    SceneOfMoments,
+    stature_m,
+)
+from pipelines.reconstruction.doubts.score import fit, solve
 
 WITHOUT_ACTOR = cast(Sampled, type("", (), {"hips": None})())
 SIGMA = np.array([0.1, np.radians(0.5), 0.02, np.radians(0.1), 0.02, np.radians(0.1)])

@@ -21,10 +21,16 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
 )
 from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.body import STATURE_M, trunk_direction
-from pipelines.reconstruction.doubts.fit import Fit, fit, picture_variance, solve
-from pipelines.reconstruction.doubts.scene import JOINTS, Filmed, Sampled, SceneOfMoments, scene_of
-from pipelines.reconstruction.doubts.score import Base, Score, score
+from pipelines.reconstruction.doubts.scene import (
+    JOINTS,
+    STATURE_M,
+    Filmed,
+    Sampled,
+    SceneOfMoments,
+    scene_of,
+    trunk_direction,
+)
+from pipelines.reconstruction.doubts.score import Base, Fit, Score, fit, picture_variance, score, solve
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""

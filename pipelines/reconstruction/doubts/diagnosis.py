@@ -36,11 +36,9 @@ from pipelines.reconstruction.doubts.alternatives import (
     of_scale,
     of_times,
 )
-from pipelines.reconstruction.doubts.body import STATURE_M
-from pipelines.reconstruction.doubts.fit import fit
 from pipelines.reconstruction.doubts.logs import doubts_of_logs
-from pipelines.reconstruction.doubts.scene import Sampled, sample, scene_of
-from pipelines.reconstruction.doubts.score import Score, base_of, residuals_px, score
+from pipelines.reconstruction.doubts.scene import STATURE_M, Sampled, sample, scene_of
+from pipelines.reconstruction.doubts.score import Score, base_of, fit, residuals_px, score
 from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt
