@@ -3,11 +3,16 @@
     python -m benchmarks.mistakes [--kept] [--less-usual] [FLIGHT ...]
     python -m benchmarks.mistakes --right 40 [--seed 100]          # right flights: none should be doubted
     python -m benchmarks.mistakes --corpus tuning|kept             # with real detectors on rendered pictures
+    python -m benchmarks.mistakes --expected 42 [--seed 900]       # are expected errors right?
 
 Right flights (simulated, modelled keypoints) are described anew with one mistake each. A mistake counts if
 the error of the skeleton grows by more than 20 %, or nothing can be reconstructed. `named`: the first doubt
-has the right code. `mended`: the lines of its remedy, put into the manifest, bring the error back to within
-10 % of the right one. Every third of the right flights is of somebody who lies down or turns cartwheels.
+has the right code. The remedy of the first doubt, right or wrong, is put into the manifest. `mended`: that
+brings the error back to within 10 % of the right one; `worse`: it raises the error, or the misfit that the
+doubt states. Every third of the right flights is of somebody who lies down or turns cartwheels.
+
+With --expected, modelled flights of several geometries are reconstructed by `auto`, with and without their
+pose noise in flight.yaml. Counted is how often the true error lies inside the 80 % interval of the verdict.
 
 With --corpus, the flights are those of `benchmarks.corpus`. They are checked as they are, and with mistakes
 in the times of all pictures, which backgrounds alone can show. `--write` puts the counts into the results.
@@ -16,12 +21,15 @@ in the times of all pictures, which backgrounds alone can show. `--write` puts t
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 from unittest.mock import patch
 
+import numpy as np
 from ruamel.yaml import YAML
 
 from benchmarks.corpus.drawn import DrawnFlight, Given, kept_in_place_of_pictures
@@ -30,6 +38,7 @@ from benchmarks.results import fixed, keep, markdown_table
 from pipelines.check import check
 from pipelines.detect import detect, follow
 from pipelines.ingest import ingest
+from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.description import Doubt
 from pipelines.session.stages import locked
 from tests.synthetic.described_flights import (
@@ -47,14 +56,22 @@ from tests.synthetic.described_flights import (
     written,
 )
 
-Verdict = tuple[bool, bool, bool]
-"""If a mistake was doubted, named and mended."""
+
+class Outcome(NamedTuple):
+    """What became of a mistake."""
+
+    counts: bool  # the error grows by more than 20 %
+    doubted: bool
+    named: bool  # by the first doubt
+    remedied: bool  # the first doubt has a remedy
+    mended: bool
+    worse: bool
 
 
 def described(folder: Path, names: list[str], only: list[str], *, kept: bool, rare: bool) -> list[str]:
     """Make each mistake in each flight, print a line for each, and return the counts."""
-    by_drones: dict[int, list[Verdict]] = {}
-    by_mistake: dict[str, list[Verdict]] = {}
+    by_drones: dict[int, list[Outcome]] = {}
+    by_mistake: dict[str, list[Outcome]] = {}
     print("| flight | mistake | error mm | first doubt | named | after the remedy mm |")
     for flight in KEPT_ASIDE if kept else FLIGHTS:
         if names and flight.name not in names:
@@ -64,21 +81,23 @@ def described(folder: Path, names: list[str], only: list[str], *, kept: bool, ra
         row(flight.name, "none", right, doubts[0]["code"] if doubts else stopped or "-", "", "")
         for mistake in LESS_USUAL if rare else MISTAKES:
             if mistake.fits(flight) and (not only or mistake.name in only):
-                verdict = tried(own, mistake, right or float("nan"))
-                if verdict is not None:
-                    by_drones.setdefault(flight.drones, []).append(verdict)
-                    by_mistake.setdefault(mistake.name, []).append(verdict)
+                outcome = tried(own, mistake, right or float("nan"))
+                by_drones.setdefault(flight.drones, []).append(outcome)
+                by_mistake.setdefault(mistake.name, []).append(outcome)
     for name, found in by_mistake.items():
-        print(f"{name}: {sum(v[1] for v in found)} of {len(found)} named, {sum(v[2] for v in found)} mended")
-    rows = [
-        [str(drones), str(len(found)), *(str(sum(column)) for column in zip(*found, strict=True))]
-        for drones, found in sorted(by_drones.items())
-    ]
-    return markdown_table(["drones", "mistakes that count", "doubted", "named first", "mended"], rows)
+        print(f"{name}: named, remedied, mended, worse of all: {' '.join(counted(found)[1:])}")
+    header = ["drones", "mistakes that count", "doubted", "named first", "remedies", "mended", "made worse"]
+    return markdown_table(header, [[str(n), *counted(found)] for n, found in sorted(by_drones.items())])
 
 
-def tried(own: Described, mistake: Mistake, right: float) -> Verdict | None:
-    """Make a mistake; return if it was doubted, named and mended, None if it costs no more than 20 %."""
+def counted(found: Sequence[Outcome]) -> list[str]:
+    """Count the mistakes that count, and what became of them; those that any remedy made worse."""
+    columns = list(zip(*(each for each in found if each.counts), strict=True)) or [()] * 6
+    return [*(str(sum(column)) for column in columns[:-1]), str(sum(each.worse for each in found))]
+
+
+def tried(own: Described, mistake: Mistake, right: float) -> Outcome:
+    """Make a mistake, and return what became of it."""
     compared = mistake.compared(own.flight)
     if compared != "mpjpe_mm":
         right = measured(mistaken(own, None), compared)[0] or float("nan")
@@ -86,16 +105,19 @@ def tried(own: Described, mistake: Mistake, right: float) -> Verdict | None:
     error, doubts, stopped = measured(manifest, compared)
     first = doubts[0] if doubts else None
     named = first is not None and first["code"] in mistake.codes
-    after, why = None, ""
-    if first is not None and named and with_remedy(manifest, first["remedy"]):
+    after, why, remedied = None, "", first is not None and with_remedy(manifest, first["remedy"])
+    if remedied:
         with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):  # only the error is looked at
             after, _, why = measured(manifest, compared)
     mended = after is not None and after <= 1.1 * right
+    misfits = first["evidence"].get("tried", {}) if first else {}
+    raised = misfits.get("misfit_after", 0.0) > misfits.get("misfit_before", 0.0)
+    worse = raised or (remedied and error is not None and (after is None or after > 1.05 * error))
     counts = error is None or error > 1.2 * right
     verdict = ("yes" if named else "NO") if counts else f"({'yes' if named else 'no'})"
     said = f"{first['code']}: {first['what']}" if first else (stopped or "nothing")
     row(own.flight.name, mistake.name, error, said, verdict, fixed(after) if after else why)
-    return (first is not None, named, mended) if counts else None
+    return Outcome(counts, first is not None, named, remedied, mended, worse)
 
 
 def row(flight: str, mistake: str, error: float | None, said: str, named: str, after: str) -> None:
@@ -115,6 +137,53 @@ def right_flights(folder: Path, seeds: Iterable[int]) -> list[str]:
             doubted.append(doubts[0].code)
             print(f"{flight}\n  {doubts[0].code}: {doubts[0].what} {doubts[0].evidence}", flush=True)
     return markdown_table(["right flights", "doubted"], [[str(count), str(len(doubted))]])
+
+
+# --- expected errors ---------------------------------------------------------------------------------------
+
+GEOMETRIES: dict[str, tuple[int, tuple[int, ...], tuple[float, float], tuple[float, float]]] = {
+    "near": (2, (0, 1), (4, 6), (5, 35)),
+    "usual": (2, (0, 1), (8, 12), (5, 35)),
+    "far": (2, (0, 1), (18, 25), (5, 35)),
+    "opposite": (4, (0, 2), (8, 12), (5, 35)),
+    "three": (3, (0, 1, 2), (8, 14), (5, 35)),
+    "high": (2, (0, 1), (8, 12), (45, 60)),
+}
+"""Drones that fly, those of them that film, and the ranges of radius (m) and tilt (deg)."""
+
+
+def expected_errors(folder: Path, seeds: Iterable[int]) -> list[str]:
+    """Reconstruct flights of all geometries, print each, and count true errors inside the 80 % intervals."""
+    inside: dict[str, list[bool]] = {}
+    for seed in seeds:
+        draw = np.random.default_rng(seed)
+        geometry = list(GEOMETRIES)[seed % len(GEOMETRIES)]
+        flown, filming, radius_m, tilt_deg = GEOMETRIES[geometry]
+        formation = (
+            f"{{radius_m: {draw.uniform(*radius_m):.1f}, tilt_deg: {draw.uniform(*tilt_deg):.0f},"
+            f" yaw_deg: {draw.uniform(0, 360):.0f}, yaw_rate_deg_per_s: {draw.uniform(-10, 10):.1f}}}"
+        )
+        flight = replace(right_flight(seed), name=f"expected{seed}", drones=flown, formation=formation)
+        made = Described(flight, folder / flight.name).folder / "made"
+        document = YAML(typ="safe").load((made / "flight.yaml").read_text(encoding="utf-8"))
+        names = list(document["cameras"])
+        document["cameras"] = {names[index]: document["cameras"][names[index]] for index in filming}
+        document["truth"] = "truth/joints.csv"
+        stated = seed // len(GEOMETRIES) % 2 == 0
+        for camera in document["cameras"].values() if not stated else ():
+            del camera["pose_noise"]
+        session = made.parent / "expected.session"
+        shutil.rmtree(session, ignore_errors=True)
+        ingest(written(document, made / "expected.yaml"), session)
+        with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):
+            metrics = reconstruct(session, ReconstructSettings()).metrics
+        low, median, high = metrics["verdict"]["expected_error_mm"]
+        error, source = metrics["mpjpe_mm"], metrics["method_used"]["pose_noise"]
+        for kind in ("all", geometry, f"pose noise {source}"):
+            inside.setdefault(kind, []).append(low <= error <= high)
+        print(f"| {seed} | {geometry} | {source} | {error:.0f} | {low} {median} {high} |", flush=True)
+    rows = [[kind, str(len(found)), f"{np.mean(found):.0%}"] for kind, found in inside.items()]
+    return markdown_table(["flights", "number", "true error inside the 80 % interval"], rows)
 
 
 # --- rendered flights ------------------------------------------------------------------------------------
@@ -189,6 +258,7 @@ def main() -> None:
     parser.add_argument("--less-usual", action="store_true", help="make less usual mistakes instead")
     parser.add_argument("--mistake", action="append", default=[], help="only these; repeat it for several")
     parser.add_argument("--right", type=int, metavar="N", help="check random right flights instead")
+    parser.add_argument("--expected", type=int, metavar="N", help="check the expected errors of N flights")
     parser.add_argument("--seed", type=int, default=100, help="the first of the right flights")
     parser.add_argument("--corpus", choices=HALVES, help="check the flights of the corpus instead")
     parser.add_argument("--write", action="store_true", help="put the counts into docs/results.md")
@@ -197,6 +267,9 @@ def main() -> None:
     if options.right:
         key = "mistakes-right"
         lines = right_flights(options.folder, range(options.seed, options.seed + options.right))
+    elif options.expected:
+        key = "expected-errors"
+        lines = expected_errors(options.folder, range(options.seed, options.seed + options.expected))
     elif options.corpus:
         key, lines = f"mistakes-film-{options.corpus}", corpus(options.folder / "corpus", options.corpus)
     else:

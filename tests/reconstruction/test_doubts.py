@@ -18,8 +18,9 @@ from ruamel.yaml import YAML
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import compose, invert, matrix_from_quaternion, multiply, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
+from pipelines.reconstruction.doubts.alternatives import changed
 from pipelines.reconstruction.doubts.diagnosis import diagnose
-from pipelines.reconstruction.doubts.scene import scene_of
+from pipelines.reconstruction.doubts.scene import Oddity, SceneOfMoments, scene_of
 from pipelines.reconstruction.doubts.score import score
 from pipelines.reconstruction.doubts.turning import Lateness
 from pipelines.session.description import DOUBT_CODES, read_description
@@ -98,6 +99,7 @@ CASES: dict[str, tuple[str, Change]] = {
     "clock": ("clock", of_cameras(clock(0.3), "drone1")),
     "heading": ("pose", of_poses(heading(8), "drone1")),
     "rate": ("frame_rate", of_cameras(rate(25), "drone1")),  # the rays tell it, the score hardly
+    "rate of all": ("frame_rate", of_cameras(rate(25))),  # the pictures outlast the logs
     "feet": ("unit", of_poses(lambda pose: (pose[0] / 0.3048, pose[1]))),
 }
 
@@ -478,6 +480,22 @@ def test_knees_and_elbows_bend_forwards_unless_left_is_right(flight: Described) 
 
     assert share(None) > 0.8
     assert share(with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED])) < 0.2
+
+
+def test_the_standing_foot_tells_focal_lengths_but_not_scales(flight: Described) -> None:
+    sampled = sampled_of(mistaken(flight, None))
+    right = scene_of(sampled)
+
+    def tread(scene: SceneOfMoments) -> Oddity:
+        return score(sampled, scene).odd["tread"]
+
+    larger = replace(right, position=2 * right.position)
+    assert tread(larger).evidence == pytest.approx(tread(right).evidence, rel=0.05)
+    # Angles twice as large make the legs twice as long and fast; the cameras tell the pace.
+    halved = changed(right, "focal", [0, 1, 2], np.log([0.5]))
+    legs, usual = (tread(each).evidence["legs_over_pace"] for each in (halved, right))
+    assert legs == pytest.approx(2 * usual, rel=0.2)
+    assert tread(right).sigmas < 1 < tread(halved).sigmas
 
 
 def test_feet_that_rise_more_than_slopes_do_are_odd(flight: Described) -> None:

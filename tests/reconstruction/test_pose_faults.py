@@ -45,7 +45,8 @@ def scene(cameras: int) -> SceneOfMoments:
     local = np.einsum("ctji,ctkj->ctki", rotation, joints[None] - position[:, :, None])
     rays = local[..., :2] / local[..., 2:]
     sigma = np.repeat(SIGMA[None], cameras, axis=0)
-    return SceneOfMoments(rays, position, rotation, np.full(cameras, 760.0), sigma, np.full(cameras, 140.0))
+    focal_px, person_px = np.full(cameras, 760.0), np.full(cameras, 140.0)
+    return SceneOfMoments(rays, position, rotation, focal_px, sigma, person_px, np.zeros(cameras))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Alternatives to a flight's description: what is changed, in a sentence, as a scene and as a remedy.
 
 An alternative has a price that grows with its freedom: for how many there are of its kind, and for its
-numbers. So of two that explain as much, the one with less freedom is named first.
+numbers. So of two that explain as much, the one with less freedom is named first. Nothing is weighed here.
 """
 
 from __future__ import annotations
@@ -30,16 +30,9 @@ from pipelines.reconstruction.doubts.scene import (
     scene_of,
     trunk_direction,
 )
-from pipelines.reconstruction.doubts.score import Base, Fit, Score, fit, picture_variance, score, solve
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
-
-TIMES = ("clock", "frame_rate")
-"""Codes of what is tried on every flight."""
-
-LEAST_GAIN_OF_TIMES = 1.0
-"""Score that clocks and frame rates must gain to be scored exactly: half of what their margin asks."""
 
 PRICE_OF_ALL = 0.5
 """Price of an alternative of all cameras alike."""
@@ -53,16 +46,12 @@ _FLU_FROM_FRD = np.diag([1.0, -1, -1])
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
 _SIZE_FACTORS = (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3)  # pictures that a detector was given enlarged or reduced
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
-# Alternatives whose scores are farther from the best need no exact score.
-_SPARE = 2.0
-# Clocks that are off by more leave no pictures in common in short flights.
-_LONGEST_CLOCK_S = 3.0
-# The grid of clocks has this step; between its values the score is smooth.
-_CLOCK_STEP_S = 0.1
-# Smaller offsets cannot be told from noise by the score.
-_LEAST_CLOCK_S = 0.05
-# Beside a clock that scores worse than the stated one by more than this lies no better one.
-_REACH = 1.0
+# Cameras film at these rates, or at 1000/1001 of them, but for rounding.
+_USUAL_RATES_HZ, _SAME_RATE = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 100.0, 120.0, 240.0), 2e-3
+# Of the pictures of a detector few are looked at, so other rates than these may be right.
+_PRICE_OF_UNUSUAL_RATE = 1.0
+# A rate that leaves few pictures to disagree is dearer by this, times the share of pictures that it loses.
+_PRICE_OF_LOST = 2.0
 # A stated error is questioned beyond so many of its standard deviations: errors have heavy tails.
 _LEAST_SIGMAS = 5.0
 # Smaller faults do not matter beside the errors of good poses, whatever is stated of these.
@@ -89,44 +78,28 @@ class Alternative:
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
     alike: bool = False  # of times of all cameras
-    cost: float = np.inf  # of what is fitted: chi^2 of the rays, and what the numbers cost
-    score: Score | None = None
-    tried: tuple[float, float] = (np.nan, np.nan)  # the objective of the description, and with this change
 
-    @property
-    def total(self) -> float:
-        """The score with the price; what is seen directly, without a scene, wins over everything."""
-        return -np.inf if self.score is None else self.score.total + self.price
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers [n] of a description that a fit sets free."""
+
+    make: Callable[[Float], SceneOfMoments]
+    starts: Float  # [K, n]; the fit begins at the best of them
+    expected: Sequence[float]  # [n] standard deviations before the pictures are seen
+    said: Callable[[Float, Float], Alternative | None]  # of numbers [n] and their covariance [n, n]
 
 
 class Trial:
-    """The flight as described, beside which alternatives are made and scored."""
+    """The flight as described, beside which alternatives are made."""
 
-    def __init__(self, flight: Sampled, described: SceneOfMoments, base: Base) -> None:
+    def __init__(self, flight: Sampled, described: SceneOfMoments) -> None:
         self.flight = flight
         self.cameras: tuple[Filmed, ...] = flight.cameras
         self.described = described
-        self.base = base
-        self.best_total = base.total
         self.names = tuple(camera.name for camera in flight.cameras)
         self.every = list(range(len(self.names)))
         self.moving = [index for index, camera in enumerate(flight.cameras) if not camera.static]
-
-    def scored(self, alternative: Alternative) -> Alternative:
-        """Score an alternative."""
-        if alternative.scene is None:
-            return alternative
-        least = LEAST_GAIN_OF_TIMES if alternative.code in TIMES else -_SPARE
-        found = score(
-            self.flight,
-            alternative.scene,
-            self.base,
-            same_scatter=alternative.same_scatter,
-            limit=min(self.best_total + _SPARE, self.base.total - least),
-        )
-        scored = replace(alternative, score=found)
-        self.best_total = min(self.best_total, scored.total)
-        return scored
 
     def named(self, group: Sequence[int], *, of_pair: bool = False) -> tuple[str, ...]:
         """Name the cameras of a group; of two (`of_pair`) both, if neither can be told to be wrong."""
@@ -181,53 +154,45 @@ def turn_about(axis: str, degrees: float) -> Float:
 # --- times -----------------------------------------------------------------------------------------------
 
 
-def of_times(trial: Trial) -> Iterator[Alternative]:
-    """Try clocks of single cameras, and the frame rate of all and of each."""
-    for index in trial.every:
-        yield from of_clock(trial, [index])
+def rates(trial: Trial) -> Iterator[Alternative]:
+    """Try other frame rates of all cameras and of each."""
     for group, price in trial.groups(trial.every):
+        whose = "all cameras" if len(group) == len(trial.names) else trial.names[group[0]]
+        stated_hz = remedies.rate_hz(trial.cameras[group[0]])
         for factor in RATES:
-            whose = "all cameras" if len(group) == len(trial.names) else trial.names[group[0]]
-            yield trial.scored(
-                Alternative(
-                    "frame_rate",
-                    trial.named(group, of_pair=True),
-                    f"the frame rate of {whose} is {remedies.times_faster(factor)}",
-                    remedies.frame_rate(trial.cameras, group, factor),
-                    price,
-                    trial.with_times(group, slower=factor),
-                    alike=len(group) == len(trial.names),
-                )
+            usual = min(abs(stated_hz / factor / each - 1) for each in _USUAL_RATES_HZ) < _SAME_RATE
+            scene = trial.with_times(group, slower=factor)
+            dearer = _PRICE_OF_LOST * (1 - _looked_at(scene) / max(_looked_at(trial.described), 1))
+            yield Alternative(
+                "frame_rate",
+                trial.named(group, of_pair=True),
+                f"the frame rate of {whose} is {remedies.times_faster(factor)}",
+                remedies.frame_rate(trial.cameras, group, factor),
+                price + max(0.0, dearer) + (0.0 if usual else _PRICE_OF_UNUSUAL_RATE),
+                scene,
+                alike=len(group) == len(trial.names),
             )
 
 
-def of_clock(trial: Trial, group: list[int]) -> Iterator[Alternative]:
-    """Search the clock of one camera, or of all: a grid, then ever smaller steps about its best."""
+def _looked_at(scene: SceneOfMoments) -> int:
+    """Count the pictures of moments that show somebody, and of which a pose is known."""
+    posed = np.isfinite(scene.position).all(axis=-1)
+    return int((np.isfinite(scene.rays[..., 0]).any(axis=-1) & posed).sum())
+
+
+def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
+    """Move the clock of one camera, or of all."""
     alike = len(group) == len(trial.names)
     whose = "all cameras" if alike else trial.names[group[0]]
-
-    def at(late_s: float) -> Alternative:
-        return trial.scored(
-            Alternative(
-                "clock",
-                trial.named(group, of_pair=True),
-                f"the pictures of {whose} were taken {remedies.earlier_or_later(late_s)}",
-                remedies.clock(trial.cameras, group, late_s),
-                1.0 + abs(late_s) / 2,
-                trial.with_times(group, late_s),
-                alike=alike,
-            )
-        )
-
-    step_s = _CLOCK_STEP_S
-    grid = np.arange(-_LONGEST_CLOCK_S, _LONGEST_CLOCK_S + step_s / 2, step_s)
-    best, late_s = min(((at(float(s)), float(s)) for s in grid), key=lambda each: each[0].total)
-    while np.isfinite(best.total) and best.total < trial.base.total + _REACH and step_s > 0.004:
-        step_s /= 2
-        tried = [(best, late_s), *((at(late_s + s), late_s + s) for s in (-step_s, step_s))]
-        best, late_s = min(tried, key=lambda each: each[0].total)
-    if abs(late_s) >= _LEAST_CLOCK_S:
-        yield best
+    return Alternative(
+        "clock",
+        trial.named(group, of_pair=True),
+        f"the pictures of {whose} were taken {remedies.earlier_or_later(late_s)}",
+        remedies.clock(trial.cameras, group, late_s),
+        1.0 + abs(late_s) / 2,
+        trial.with_times(group, late_s),
+        alike=alike,
+    )
 
 
 # --- the world -------------------------------------------------------------------------------------------
@@ -249,12 +214,12 @@ _UPS = {
 }
 
 
-def of_level(trial: Trial) -> Iterator[Alternative]:
+def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     """Find a world whose z does not point up: people stand, and pictures are upright, along another axis.
 
     Both must say so: somebody may lie, and a camera may be rolled or look straight down.
     """
-    up = trunk_direction(solve(trial.described).joints)
+    up = trunk_direction(joints)
     steady = float(np.linalg.norm(up))
     if not steady > LEAST_STEADY_TRUNK:
         return
@@ -280,19 +245,21 @@ def of_level(trial: Trial) -> Iterator[Alternative]:
     )
 
 
-def of_scale(trial: Trial, stature: float) -> Alternative:
+def scale(trial: Trial, stature: float) -> Alternative:
     """Scale all positions so that the person has a usual stature: rays that fit go on fitting."""
-    factor, code = STATURE_M / stature, "scale"
+    # Any scale makes the person as tall as people are: that much surer the stature makes it (see `_freedom`).
+    factor, code, price = STATURE_M / stature, "scale", PRICE_OF_ALL + np.log(1 / STATURE_SHARE) / 2
     what = f"all positions are {1 / factor:.2g} times what they should be: the person is {stature:.3g} m tall"
     remedy, evidence = f"world.scale: {factor:.3g}", {"scale_sigma_share": STATURE_SHARE}
     for unit, metres in _UNITS_M.items():
         if abs(np.log(factor / metres)) < STATURE_SHARE:
-            factor, code, evidence = metres, "unit", {}
+            factor, code, evidence, price = metres, "unit", {}, PRICE_OF_ALL
             what, remedy = f"the positions are in {unit}", remedies.unit(trial.cameras, unit)
-    scene = replace(trial.described, position=trial.described.position * factor)
-    return trial.scored(
-        Alternative(code, trial.names, what, remedy, 0.5, scene, same_scatter=True, evidence=evidence)
-    )
+    # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
+    of_places = np.array([factor, 1.0] * 3)
+    described = trial.described
+    scene = replace(described, position=described.position * factor, sigma=described.sigma * of_places)
+    return Alternative(code, trial.names, what, remedy, price, scene, same_scatter=True, evidence=evidence)
 
 
 # --- alternatives without a number -----------------------------------------------------------------------
@@ -300,11 +267,6 @@ def of_scale(trial: Trial, stature: float) -> Alternative:
 
 def discrete(trial: Trial) -> Iterator[Alternative]:
     """Try exchanged pictures, other mounts and gimbals, other conventions, and other keypoints."""
-    for alternative in _discrete(trial):
-        yield trial.scored(alternative)
-
-
-def _discrete(trial: Trial) -> Iterator[Alternative]:
     yield from _exchanged_pictures(trial)
     yield from _mounts(trial)
     yield from _gimbals(trial)
@@ -501,8 +463,6 @@ def _conventions(trial: Trial) -> Iterator[Alternative]:
     ned, below, swapped = place @ _ENU_FROM_NED.T, place * [1.0, 1.0, -1.0], place[..., [1, 0, 2]]
     on_body, own = camera @ _FLU_FROM_OPTICAL, body_back @ mounts
     table: list[tuple[str, str, str, Float, Float]] = [
-        ("axes", f"{in_axes} a body with {frame} axes", exchanged, turned, ned),
-        ("axes", f"{in_axes} the camera", exchanged, _ENU_FROM_NED @ camera, ned),
         ("axes", f"the positions count z {z}wards, the attitudes do not", upside_down, camera, below),
         ("axes", "the positions have x and y exchanged", "", camera, swapped),
         ("convention", f"the poses are {of_camera}", inverted, camera_back, camera_origin),
@@ -512,7 +472,12 @@ def _conventions(trial: Trial) -> Iterator[Alternative]:
         ("convention", "the poses are of the body, and are taken for the camera's", the_body, on_body, place),
         ("convention", "the poses are of the camera, and are taken for the body's", its_own, body, place),
     ]
-    if any(cameras[index].entry.poses.mount is not None for index in trial.moving):
+    held = [cameras[index].entry.poses for index in trial.moving]
+    if any(poses.mount or poses.in_gimbal for poses in held):
+        table.append(("axes", f"{in_axes} a body with {frame} axes", exchanged, turned, ned))
+    if any(poses.mount is None for poses in held):
+        table.append(("axes", f"{in_axes} the camera", exchanged, _ENU_FROM_NED @ camera, ned))
+    if any(poses.mount for poses in held):
         # Of poses of the camera itself, it would be a roll by 180 deg.
         remedy = remedies.mount(cameras, trial.moving, lambda mount: _FLU_FROM_FRD @ mount)
         what = "the body's axes are FRD (forward, right, down)"
@@ -609,17 +574,6 @@ _EXPECTED_M = 30.0
 _STARTS_DEG = {"pitch": range(-90, 91, 15), "focal": (0,), "shift": (0,)}
 
 
-def _freedom(found: Fit, expected: Sequence[float]) -> float:
-    """Return what numbers cost as chi^2, beside their fit: how much surer the rays make them.
-
-    It is the logarithm of their volume before and after (the Occam factor; MacKay 2003, chapter 28). So a
-    number that stated errors of poses leave open costs little, and gains little.
-    """
-    sign, volume = np.linalg.slogdet(found.covariance)
-    before = 2 * float(np.log(expected).sum())
-    return max(0.0, before - float(volume)) if sign > 0 else np.inf
-
-
 def changed(scene: SceneOfMoments, kind: str, group: Sequence[int], numbers: Float) -> SceneOfMoments:
     """Return the scene with numbers [n] of some cameras changed."""
     chosen = list(group)
@@ -644,44 +598,30 @@ def zoom(logarithm: float) -> float:
     return float(np.exp(np.clip(logarithm, -_MOST_ZOOM, _MOST_ZOOM)))
 
 
-def fitted(trial: Trial, kind: str, group: Sequence[int]) -> Fit:
-    """Fit numbers of some cameras, from where the rays miss each other least."""
-    scene = trial.described
-    starts = np.zeros((len(degrees := _STARTS_DEG.get(kind, range(-180, 180, 15))), NUMBERS[kind]))
-    starts[:, -1] = np.radians(list(degrees))
-
-    def misfit(numbers: Float) -> float:
-        solved = solve(changed(scene, kind, group, numbers))
-        chi2 = np.where(solved.in_front, solved.chi2, np.inf)[solved.views >= 2]
-        return float(np.median(chi2)) if chi2.size else np.inf
-
-    start = min(starts, key=misfit) if len(starts) > 1 else starts[0]
-    return fit(trial.flight, lambda numbers: changed(scene, kind, group, numbers), start, _expected(kind))
-
-
 def _expected(kind: str) -> list[float]:
     """Return the standard deviations of numbers before the pictures are seen."""
     angle = [_EXPECTED_ZOOM if kind == "focal" else _EXPECTED_RAD]
     return [_EXPECTED_M] * (3 * (NUMBERS[kind] >= 3)) + angle * (NUMBERS[kind] in (1, 4))
 
 
-def of_all_numbers(trial: Trial) -> Iterator[Alternative]:
-    """Fit numbers that all cameras have in common, and each log's own zero."""
+def numbers_of_all(trial: Trial) -> Iterator[Numbers]:
+    """Set free what all cameras have in common, and each log's own zero."""
     for kind in _OF_ALL:
-        yield from _of_numbers(trial, kind, trial.every if kind == "focal" else trial.moving)
+        if group := trial.every if kind == "focal" else trial.moving:
+            yield _numbers(trial, kind, group)
     if len(trial.names) > 2 and trial.moving:
-        yield trial.scored(of_origins(trial, "every log counts positions from a place of its own")[0])
+        yield own_origins(trial, trial.names, "every log counts positions from a place of its own")
 
 
-def of_one_number(trial: Trial) -> Iterator[Alternative]:
-    """Fit numbers of one camera: where its log has zero and north, how it is turned, its focal length."""
+def numbers_of_one(trial: Trial) -> Iterator[Numbers]:
+    """Set free what one camera has: where its log has zero and north, how it is turned, its focal length."""
     located = trial.flight.hips is not None or trial.flight.ground is not None
     for index, kind in product(trial.every, NUMBERS):
         if index not in trial.moving and kind != "focal":
             continue
         if kind in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
             continue  # of two, one alone can be turned against the other
-        yield from _of_numbers(trial, kind, [index])
+        yield _numbers(trial, kind, [index])
 
 
 def _matters(trial: Trial, kind: str, group: Sequence[int], numbers: Float) -> bool:
@@ -694,13 +634,28 @@ def _matters(trial: Trial, kind: str, group: Sequence[int], numbers: Float) -> b
     return bool(shift_m >= max(position_m, _LEAST_SHIFT_M) or turn_rad >= max(rotation_rad, _LEAST_TURN_RAD))
 
 
-def _of_numbers(trial: Trial, kind: str, group: list[int]) -> Iterator[Alternative]:
-    found = fitted(trial, kind, group) if group else None
-    if found is None or not _matters(trial, kind, group, found.numbers):
-        return
-    cameras, whose, number = trial.cameras, trial.whose(group), float(found.numbers[-1])
+def _numbers(trial: Trial, kind: str, group: list[int]) -> Numbers:
+    """Set numbers of some cameras free, from where the rays miss each other least."""
+    degrees = list(_STARTS_DEG.get(kind, range(-180, 180, 15)))
+    starts = np.zeros((len(degrees), NUMBERS[kind]))
+    starts[:, -1] = np.radians(degrees)
+    return Numbers(
+        lambda numbers: changed(trial.described, kind, group, numbers),
+        starts,
+        _expected(kind),
+        lambda numbers, covariance: _of_numbers(trial, kind, group, numbers, covariance),
+    )
+
+
+def _of_numbers(
+    trial: Trial, kind: str, group: list[int], numbers: Float, covariance: Float
+) -> Alternative | None:
+    """State fitted numbers and their remedy; None if they are too small to matter."""
+    if not _matters(trial, kind, group, numbers):
+        return None
+    cameras, whose, number = trial.cameras, trial.whose(group), float(numbers[-1])
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
-    shift = found.numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
+    shift = numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
     far = f"{np.linalg.norm(shift):.1f} m"
     mounted = kind in ("pitch", "roll", "focal")  # of one camera, whatever the others
     what = {
@@ -724,34 +679,22 @@ def _of_numbers(trial: Trial, kind: str, group: list[int]) -> Iterator[Alternati
     else:
         turn = turn_about("x" if kind == "pitch" else "z", degrees)
         code, remedy = "mount", remedies.mount(cameras, group, lambda mount: mount @ turn)
-    variance = np.diag(found.covariance)
+    variance = np.diag(covariance)
     evidence = {}
     if NUMBERS[kind] >= 3:
         evidence["shift_sigma_m"] = round(float(np.sqrt(variance[:3].sum())), 2)
     if kind not in ("shift", "focal") and variance.size:
         evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
-    yield trial.scored(
-        Alternative(
-            code,
-            trial.named(group, of_pair=not mounted),
-            what,
-            remedy,
-            PRICE_OF_ONE if len(group) < len(trial.names) else PRICE_OF_ALL,
-            found.scene,
-            evidence=evidence,
-            cost=found.cost + _freedom(found, _expected(kind)),
-        )
-    )
+    price = PRICE_OF_ONE if len(group) < len(trial.names) else PRICE_OF_ALL
+    named = trial.named(group, of_pair=not mounted)
+    return Alternative(code, named, what, remedy, price, evidence=evidence)
 
 
-def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
+def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
     """Place the logs of all drones, of which each counts from a place of its own.
 
     The search begins where each camera by itself sees a person of usual stature: as far away as they are
     tall in its pictures. Without a logged actor, the world is that of the first log.
-
-    Returns:
-        The alternative, and False if no place was found.
     """
     flight, scene = trial.flight, trial.described
     moved = (
@@ -770,23 +713,16 @@ def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
         position[moved] += numbers.reshape(-1, 1, 3)
         return replace(scene, position=position)
 
-    found = fit(flight, make, np.concatenate([*start, np.zeros(0)]), [_EXPECTED_M] * (3 * len(moved)))
-    shifts = np.zeros((len(trial.names), 3))
-    shifts[moved] = found.numbers.reshape(-1, 3)
-    sigma_m = (
-        np.sqrt(np.diag(found.covariance).reshape(-1, 3).sum(axis=1)) if found.covariance.size else [0.0]
-    )
-    return Alternative(
-        "origin",
-        trial.names,
-        what,
-        remedies.own_origins(trial.cameras, shifts),
-        PRICE_OF_ALL,
-        found.scene,
-        same_scatter=True,
-        evidence={"shift_sigma_m": round(float(np.max(sigma_m)), 2)},
-        cost=found.cost + _freedom(found, [_EXPECTED_M] * (3 * len(moved))),
-    ), bool(np.isfinite(found.cost))
+    def said(numbers: Float, covariance: Float) -> Alternative:
+        shifts = np.zeros((len(trial.names), 3))
+        shifts[moved] = numbers.reshape(-1, 3)
+        sigma_m = np.sqrt(np.diag(covariance).reshape(-1, 3).sum(axis=1)).max() if covariance.size else 0.0
+        remedy, evidence = remedies.own_origins(trial.cameras, shifts), {"shift_sigma_m": round(sigma_m, 2)}
+        return Alternative(
+            "origin", cameras, what, remedy, PRICE_OF_ALL, same_scatter=True, evidence=evidence
+        )
+
+    return Numbers(make, np.concatenate(start)[None], [_EXPECTED_M] * (3 * len(moved)), said)
 
 
 # --- errors that are larger than stated ------------------------------------------------------------------
@@ -794,35 +730,27 @@ def of_origins(trial: Trial, what: str) -> tuple[Alternative, bool]:
 _NOISE_FACTORS = (2.0, 5.0, 12.0, 36.0)  # with the last, poses of one camera hardly count
 
 
-def of_noise(trial: Trial) -> Iterator[Alternative]:
-    """Fit errors that are some times larger than stated: of all poses, or of one camera's.
+def larger_errors(trial: Trial) -> Iterator[list[Alternative]]:
+    """Let errors be some times larger than stated: of all poses, or of one camera's.
 
     Their score says nothing, since larger errors excuse everything; only their cost counts.
     """
     groups = [trial.every] if all(trial.cameras[index].states_noise for index in trial.moving) else []
     groups += [[index] for index in trial.moving] if len(trial.names) > 2 else []  # of two, either errs more
     for group in groups if trial.moving else ():
-        tried = [_noisier(trial, factor, group) for factor in _NOISE_FACTORS]
-        yield trial.scored(min(tried, key=lambda each: each.cost))
-
-
-def _noisier(trial: Trial, factor: float, group: Sequence[int]) -> Alternative:
-    """Fit errors of some cameras' poses that are larger by a factor."""
-    scene = trial.described
-    sigma = scene.sigma.copy()
-    sigma[list(group)] *= factor
-    wider = replace(scene, sigma=sigma)
-    # Larger errors are less likely to be what they are: 6 of each camera, and 2 of each picture.
-    pictures = np.isfinite(scene.rays[..., 0]).any(axis=-1).sum(axis=1)
-    before, after = (picture_variance(each) for each in (scene, wider))
-    unlikely = 12 * len(group) * np.log(factor) + 2 * float(pictures @ np.log(after / before))
-    whose = "" if len(group) == len(trial.names) else f" of {trial.names[group[0]]}"
-    return Alternative(
-        "pose" if whose else "noise",
-        trial.named(group),
-        f"errors of the poses{whose} are larger than stated, about {factor:g} times",
-        remedies.pose_noise(trial.cameras, group, factor),
-        np.inf,
-        wider,
-        cost=fit(trial.flight, lambda _: wider).cost + unlikely,
-    )
+        whose = "" if len(group) == len(trial.names) else f" of {trial.names[group[0]]}"
+        tried = []
+        for factor in _NOISE_FACTORS:
+            sigma = trial.described.sigma.copy()
+            sigma[group] *= factor
+            tried.append(
+                Alternative(
+                    "pose" if whose else "noise",
+                    trial.named(group),
+                    f"errors of the poses{whose} are larger than stated, about {factor:g} times",
+                    remedies.pose_noise(trial.cameras, group, factor),
+                    np.inf,
+                    replace(trial.described, sigma=sigma),
+                )
+            )
+        yield tried

@@ -17,33 +17,35 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Int64
-from pipelines.reconstruction.doubts import remedies
-from pipelines.reconstruction.doubts.alternatives import (
-    LEAST_GAIN_OF_TIMES,
-    PRICE_OF_ALL,
-    RATES,
-    TIMES,
-    Alternative,
-    Trial,
-    discrete,
-    of_all_numbers,
-    of_clock,
-    of_level,
-    of_noise,
-    of_one_number,
-    of_origins,
-    of_scale,
-    of_times,
-)
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.reconstruction.doubts import alternatives, remedies
+from pipelines.reconstruction.doubts.alternatives import PRICE_OF_ALL, RATES, Alternative, Numbers, Trial
 from pipelines.reconstruction.doubts.logs import doubts_of_logs
-from pipelines.reconstruction.doubts.scene import STATURE_M, Sampled, sample, scene_of
-from pipelines.reconstruction.doubts.score import Score, base_of, fit, residuals_px, score
+from pipelines.reconstruction.doubts.scene import STATURE_M, Sampled, SceneOfMoments, sample, scene_of
+from pipelines.reconstruction.doubts.score import (
+    Base,
+    Fit,
+    Score,
+    base_of,
+    fit,
+    picture_variance,
+    residuals_px,
+    score,
+    solve,
+    surprise,
+    unposed,
+)
 from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
+
+TIMES = ("clock", "frame_rate")
+"""Codes of what is tried on every flight."""
+
+LEAST_GAIN_OF_TIMES = 1.0
+"""Score that clocks and frame rates must gain to be scored exactly: half of what their margin asks."""
 
 MARGIN = 3.0
 """By how much an alternative must lower the objective, beyond its price, to be named."""
@@ -80,6 +82,16 @@ _BELOW_M = 1.0
 _ALIKE = 1.0
 # So many alternatives of the best scores are fitted to the rays.
 _FITTED = 12
+# Alternatives whose scores are farther from the best need no exact score.
+_SPARE = 2.0
+# Clocks that are off by more leave no pictures in common in short flights.
+_LONGEST_CLOCK_S = 3.0
+# The grid of clocks has this step; between its values the score is smooth.
+_CLOCK_STEP_S = 0.1
+# Smaller offsets cannot be told from noise by the score.
+_LEAST_CLOCK_S = 0.05
+# Beside a clock that scores worse than the stated one by more than this lies no better one.
+_REACH = 1.0
 
 
 def doubts_of(
@@ -157,7 +169,8 @@ def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | No
 def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doubt]:
     """Find what is odd about a flight, and why, that first that explains the most.
 
-    A flight whose cameras share no time is not doubted here.
+    A flight whose cameras share no time is not doubted here. A world on its side is named where no usual
+    convention turns it upright.
 
     Args:
         flight: the flight.
@@ -165,40 +178,64 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     """
     if flight is None:
         return []
-    described = scene_of(flight)
-    base, found = base_of(flight, described)
-    trial = Trial(flight, described, base)
+    trial = Trial(flight, scene_of(flight))
+    base, found = base_of(flight, trial.described)
     # A turned world leaves rays and bodies as they are; rolled cameras mirror the body.
     mirrored = any(found.odd[name].sigmas >= STRANGE for name in ("face", "bend") if name in found.odd)
     fits = found.misfit < MISSED and found.scatter < SCATTERED and not mirrored
-    level = of_level(trial) if fits else ()
-    objective = Objective(trial)
-    tried = [*level, *_of_logs(trial), *_of_turns(trial, objective, late), *of_times(trial)]
+    objective = Objective(trial, base)
+    clocks = [objective.best_clock([index]) for index in trial.every]
+    tried = [
+        *_of_logs(objective),
+        *_of_turns(objective, late),
+        *clocks,
+        *map(objective.scored, alternatives.rates(trial)),
+    ]
     strange = _is_strange(found)
     odd = strange or base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
     if odd:
-        tried += [*discrete(trial), *of_all_numbers(trial)]
-        tried += of_clock(trial, trial.every) if trial.moving else ()
+        tried += map(objective.scored, alternatives.discrete(trial))
+        tried += map(objective.with_numbers, alternatives.numbers_of_all(trial))
+        tried += [objective.best_clock(trial.every)] if trial.moving else []
     if strange and np.isfinite(found.stature_m):
-        tried.append(of_scale(trial, found.stature_m))
-    if odd or objective.fitted.strain >= STRAINED:
-        tried += [*of_one_number(trial), *of_noise(trial)]
-    causes = _causes(trial, objective, tried, odd) or _below_zero(trial)
+        tried.append(objective.scored(alternatives.scale(trial, found.stature_m)))
+    if odd or objective.described.strain >= STRAINED:
+        tried += map(objective.with_numbers, alternatives.numbers_of_one(trial))
+        tried += map(objective.with_noise, alternatives.larger_errors(trial))
+    causes = _causes(objective, [each for each in tried if each is not None], odd)
+    if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
+        level = alternatives.level(trial, solve(trial.described).joints) if fits else ()
+        causes = [Tried(each) for each in level] or causes or _below_zero(objective)
     doubts = [_doubt(trial, each, found) for each in causes]
     if doubts or strange or base.total >= DOUBTFUL:
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
+        named |= {"clock"} if "frame_rate" in named else set()
         doubts += [each for each in _oddities(trial, found, alone=not doubts) if each.code not in named]
     return doubts
 
 
 def _is_strange(described: Score) -> bool:
     """Test if a single oddity is so large that it is said, whatever the total."""
-    limits = {"size": STRANGE_SIZE}
+    limits = {"size": STRANGE_SIZE, "unposed": np.inf}  # a log may end early
     return any(each.sigmas >= limits.get(name, STRANGE) for name, each in described.odd.items())
 
 
 # --- one number by which all alternatives are compared ----------------------------------------------------
+
+
+class Tried(NamedTuple):
+    """An alternative, and how well it fits."""
+
+    alternative: Alternative
+    score: Score | None = None  # None of what is seen directly
+    cost: float = np.inf  # of what is fitted: chi^2 of the rays, and what the numbers cost
+    misfits: tuple[float, float] = (np.nan, np.nan)  # the objective of the description, and with this change
+
+    @property
+    def total(self) -> float:
+        """The score with the price; what is seen directly, without a scene, wins over everything."""
+        return -np.inf if self.score is None else self.score.total + self.alternative.price
 
 
 class Compared(NamedTuple):
@@ -234,56 +271,129 @@ class Objective:
     (the likelihood of Student's t).
     """
 
-    def __init__(self, trial: Trial) -> None:
-        self._trial = trial
-        self._pictures = float(np.isfinite(trial.described.rays[..., 0]).any(axis=-1).sum())
-        self.fitted = fit(trial.flight, lambda _: trial.described)
+    def __init__(self, trial: Trial, base: Base) -> None:
+        self.trial, self.base, self.best_total = trial, base, base.total
+        self._pictures = np.isfinite(trial.described.rays[..., 0]).any(axis=-1).sum(axis=1)  # [C]
+        self.described = self._fit(trial.described)
 
-    def _rays(self, cost: float) -> float:
-        return 2 * self._pictures * float(np.log1p(cost / self._pictures)) / COST_OF_SCORE
+    def _fit(self, scene: SceneOfMoments) -> Fit:
+        return fit(self.trial.flight, lambda _: scene)
 
-    def compared(self, alternative: Alternative) -> Compared:
+    def scored(self, alternative: Alternative, cost: float = np.inf) -> Tried:
+        """Score an alternative."""
+        if alternative.scene is None:
+            return Tried(alternative)
+        least = LEAST_GAIN_OF_TIMES if alternative.code in TIMES else -_SPARE
+        limit = min(self.best_total + _SPARE, self.base.total - least)
+        same = alternative.same_scatter
+        found = score(self.trial.flight, alternative.scene, self.base, same_scatter=same, limit=limit)
+        tried = Tried(alternative, found, cost)
+        self.best_total = min(self.best_total, tried.total)
+        return tried
+
+    def best_clock(self, group: list[int]) -> Tried | None:
+        """Search the clock of one camera, or of all: a grid, then ever smaller steps about its best."""
+
+        def at(late_s: float) -> tuple[Tried, float]:
+            return self.scored(alternatives.clock(self.trial, group, late_s)), late_s
+
+        step_s = _CLOCK_STEP_S
+        grid = np.arange(-_LONGEST_CLOCK_S, _LONGEST_CLOCK_S + step_s / 2, step_s)
+        best, late_s = min(map(at, grid.tolist()), key=lambda each: each[0].total)
+        while np.isfinite(best.total) and best.total < self.base.total + _REACH and step_s > 0.004:
+            step_s /= 2
+            beside = [(best, late_s), at(late_s - step_s), at(late_s + step_s)]
+            best, late_s = min(beside, key=lambda each: each[0].total)
+        return best if abs(late_s) >= _LEAST_CLOCK_S else None
+
+    def with_numbers(self, free: Numbers) -> Tried | None:
+        """Fit numbers, from where the rays miss each other least; None if they are too small to matter.
+
+        Numbers cost as chi^2, beside their fit, the logarithm of how much surer the rays make them (the Occam
+        factor; MacKay 2003, chapter 28). So one that stated errors leave open costs little, and gains little.
+        """
+
+        def misfit(numbers: Float) -> float:
+            solved = solve(free.make(numbers))
+            chi2 = np.where(solved.in_front, solved.chi2, np.inf)[solved.views >= 2]
+            return float(np.median(chi2)) if chi2.size else np.inf
+
+        start = min(free.starts, key=misfit) if len(free.starts) > 1 else free.starts[0]
+        found = fit(self.trial.flight, free.make, start, free.expected)
+        alternative = free.said(found.numbers, found.covariance)
+        if alternative is None or not np.isfinite(found.cost):
+            return None
+        sign, volume = np.linalg.slogdet(found.covariance)
+        surer = max(0.0, 2 * float(np.log(free.expected).sum()) - float(volume)) if sign > 0 else np.inf
+        return self.scored(replace(alternative, scene=found.scene), found.cost + surer)
+
+    def with_noise(self, tried: Sequence[Alternative]) -> Tried:
+        """Take the factor of larger errors that fits best."""
+        return min(
+            (self.scored(each, self._cost_of_noise(each)) for each in tried), key=lambda each: each.cost
+        )
+
+    def _cost_of_noise(self, alternative: Alternative) -> float:
+        """Return the chi^2 of larger errors: 6 of each camera and 2 of each picture are less likely."""
+        wider, described = alternative.scene, self.trial.described
+        if wider is None:
+            return np.inf
+        constant = 12 * float(np.log(wider.sigma[:, 0] / described.sigma[:, 0]).sum())
+        changing = 2 * float(self._pictures @ np.log(picture_variance(wider) / picture_variance(described)))
+        return self._fit(wider).cost + constant + changing
+
+    def _rays(self, cost: float, scene: SceneOfMoments) -> float:
+        pictures = float(self._pictures.sum())
+        return 2 * pictures * float(np.log1p(cost / pictures)) / COST_OF_SCORE + surprise(unposed(scene))
+
+    def compared(self, tried: Tried) -> Compared:
         """Return the objective of the description, and that of an alternative with its price.
 
         Another clock leaves moments out: then the description is judged by the same moments. Larger errors
         excuse everything: of them only the chi^2 counts.
         """
-        trial, scene = self._trial, alternative.scene
-        if scene is None or alternative.score is None:
+        scene, described = tried.alternative.scene, self.trial.described
+        if scene is None or tried.score is None:
             return Compared(np.inf, -np.inf, np.inf, -np.inf)
-        before, total = self.fitted.cost, trial.base.total
-        if alternative.code in (*TIMES, "videos_swapped"):
+        before, total = self.described.cost, self.base.total
+        if tried.alternative.code in (*TIMES, "videos_swapped"):
             seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
-            same = replace(trial.described, rays=np.where(seen, trial.described.rays, np.nan))
-            before = fit(trial.flight, lambda _: same).cost
-            total = min(total, score(trial.flight, same, trial.base).total)
-        cost = alternative.cost if np.isfinite(alternative.cost) else fit(trial.flight, lambda _: scene).cost
-        scores = (0.0, 0.0) if alternative.price == np.inf else (total, alternative.total)
-        return Compared(*scores, self._rays(before), self._rays(cost))
+            same = replace(described, rays=np.where(seen, described.rays, np.nan))
+            before = self._fit(same).cost
+            total = min(total, score(self.trial.flight, same, self.base).total)
+        cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene).cost
+        scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
+        return Compared(*scores, self._rays(before, described), self._rays(cost, scene))
 
 
-def _causes(trial: Trial, objective: Objective, tried: Sequence[Alternative], odd: bool) -> list[Alternative]:
+def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tried]:
     """Return the alternatives that lower the objective next to most, one of each code; none if by too little.
 
     Those without a free number are first. What leaves something odd is no cause.
     """
-    by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=lambda each: each.total)
-    by_score = [each for each in by_score[:_FITTED] if each.total <= trial.base.total - LEAST_GAIN_OF_TIMES]
+
+    def without_rays(each: Tried) -> float:
+        scene = each.alternative.scene
+        return each.total + (0.0 if scene is None else surprise(unposed(scene)))
+
+    by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=without_rays)
+    most = objective.base.total + surprise(unposed(objective.trial.described)) - LEAST_GAIN_OF_TIMES
+    by_score = [each for each in by_score[:_FITTED] if without_rays(each) <= most]
     weighed = []
     for each in [*by_score, *(each for each in tried if np.isfinite(each.cost))]:
         found = objective.compared(each)
-        if found.is_enough(each, odd):
-            tried_as = (found.score_before + found.rays_before, found.score_after + found.rays_after)
-            weighed.append((found.gain, replace(each, tried=tried_as)))
+        if found.is_enough(each.alternative, odd):
+            misfits = (found.score_before + found.rays_before, found.score_after + found.rays_after)
+            weighed.append((found.gain, each._replace(misfits=misfits)))
     weighed.sort(key=lambda pair: -pair[0])
-    causes: list[tuple[float, Alternative]] = []
+    causes: list[tuple[float, Tried]] = []
     for gain, each in weighed:
         if causes and gain < causes[0][0] - _ALIKE:
             break
-        if _leaves_no_doubt(trial.flight, each):
+        if _leaves_no_doubt(objective.trial.flight, each.alternative):
             causes.append((gain, each))
     causes.sort(key=lambda pair: (np.isfinite(pair[1].cost), -pair[0]))
-    return list({each.code: each for _, each in reversed(causes)}.values())[::-1]
+    return list({each.alternative.code: each for _, each in reversed(causes)}.values())[::-1]
 
 
 def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
@@ -298,18 +408,19 @@ def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
     return found.total < DOUBTFUL and not _is_strange(found)
 
 
-def _below_zero(trial: Trial) -> list[Alternative]:
+def _below_zero(objective: Objective) -> list[Tried]:
     """Doubt drones that fly below zero all the time, where neither a map nor an actor says how high zero is.
 
     Where all fly about equally high, the rays are alike with z upwards and downwards: no gain is asked for.
     """
+    trial = objective.trial
     located = trial.flight.hips is not None or trial.flight.ground is not None
     height = trial.described.position[trial.moving, :, 2]
     if located or not np.isfinite(height).any() or np.nanmax(height) > -_BELOW_M:
         return []
     place = trial.described.position.copy()
     place[trial.moving, :, 2] *= -1
-    turned = trial.scored(
+    turned = objective.scored(
         Alternative(
             "axes",
             trial.names,
@@ -319,13 +430,13 @@ def _below_zero(trial: Trial) -> list[Alternative]:
             replace(trial.described, position=place),
         )
     )
-    return [turned] if turned.total <= trial.base.total + _ALIKE + PRICE_OF_ALL else []
+    return [turned] if turned.total <= objective.base.total + _ALIKE + PRICE_OF_ALL else []
 
 
 # --- what is seen without a scene -------------------------------------------------------------------------
 
 
-def _of_turns(trial: Trial, objective: Objective, tried: Sequence[Lateness]) -> list[Alternative]:
+def _of_turns(objective: Objective, tried: Sequence[Lateness]) -> list[Tried]:
     """State the times that the backgrounds tell, where they tell them surely.
 
     The rays help to say whose these are: other times of one camera change how its rays meet those of the
@@ -333,12 +444,13 @@ def _of_turns(trial: Trial, objective: Objective, tried: Sequence[Lateness]) -> 
     """
     if not tried or tried[0].gain < LEAST_GAIN:
         return []
+    trial = objective.trial
 
     def gain(late: Lateness) -> float:
         if len(late.cameras) == len(trial.names):
             return late.gain
         scene = trial.with_times(late.cameras, late.late_s, late.slower)
-        found = objective.compared(trial.scored(Alternative("clock", (), "", "", np.inf, scene)))
+        found = objective.compared(objective.scored(Alternative("clock", (), "", "", np.inf, scene)))
         return late.gain + COST_OF_SCORE * found.gain
 
     late = max(tried, key=gain)
@@ -355,52 +467,52 @@ def _of_turns(trial: Trial, objective: Objective, tried: Sequence[Lateness]) -> 
         code, remedy = "clock", remedies.clock(cameras, late.cameras, late.late_s)
         what = f"the pictures of {whose} were taken {remedies.earlier_or_later(late.late_s)}, {by}"
         evidence["clock_sigma_s"] = round(late.sigma_s, 3)
-    return [Alternative(code, trial.named(late.cameras), what, remedy, 0.0, evidence=evidence)]
+    return [Tried(Alternative(code, trial.named(late.cameras), what, remedy, 0.0, evidence=evidence))]
 
 
-def _of_logs(trial: Trial) -> list[Alternative]:
+def _of_logs(objective: Objective) -> list[Tried]:
     """Find cameras that fly the same path, or start at the same place: no picture is needed for that.
 
     Pictures tell where the logs have their zeros. Drones that hover together may also be apart in another
     unit: then the zeros have to explain more.
     """
-    found = []
+    found, trial = [], objective.trial
     for doubt in doubts_of_logs({each.name: (each.entry, each.camera.trajectory) for each in trial.cameras}):
-        seen = Alternative(doubt.code, tuple(doubt.cameras), doubt.what, doubt.remedy, 0.0)
+        seen = Tried(Alternative(doubt.code, tuple(doubt.cameras), doubt.what, doubt.remedy, 0.0))
         if doubt.code == "origin":
-            placed, known = of_origins(trial, doubt.what)
-            if known:
-                apart_m = doubt.evidence["apart_m"]
-                hover = isinstance(apart_m, float) and apart_m < _HOVERING_M
-                scene = placed.scene if hover else None
-                seen = replace(placed, cameras=seen.cameras, scene=scene)
-        found.append(trial.scored(seen))
+            placed = objective.with_numbers(alternatives.own_origins(trial, tuple(doubt.cameras), doubt.what))
+            apart_m = doubt.evidence["apart_m"]
+            hover = isinstance(apart_m, float) and apart_m < _HOVERING_M
+            if placed is not None:
+                seen = placed if hover else Tried(placed.alternative)
+        found.append(seen)
     return found
 
 
 # --- what is said -----------------------------------------------------------------------------------------
 
 
-def _doubt(trial: Trial, cause: Alternative, described: Score) -> Doubt:
+def _doubt(trial: Trial, cause: Tried, described: Score) -> Doubt:
+    alternative = cause.alternative
     evidence = {"residual_px": residuals_px(trial.described)[0], "score": round(described.total, 2)}
-    if cause.score is not None and cause.scene is not None:
+    if cause.score is not None and alternative.scene is not None:
         evidence |= {
-            "residual_px_if": residuals_px(cause.scene)[0],
+            "residual_px_if": residuals_px(alternative.scene)[0],
             "score_if": round(cause.score.total, 2),
             "stature_m": round(described.stature_m, 3),
             "stature_m_if": round(cause.score.stature_m, 3),
         }
-    evidence |= cause.evidence
+    evidence |= alternative.evidence
     told: dict[str, float | dict[str, float]] = {k: v for k, v in evidence.items() if np.isfinite(v)}
-    if np.isfinite(cause.tried).all():
-        before, after = (round(value, 2) for value in cause.tried)
+    if np.isfinite(cause.misfits).all():
+        before, after = (round(value, 2) for value in cause.misfits)
         told["tried"] = {"misfit_before": before, "misfit_after": after, "doubts_after": 0}
     return Doubt(
-        code=cause.code,
-        cameras=list(cause.cameras),
-        what=cause.what,
+        code=alternative.code,
+        cameras=list(alternative.cameras),
+        what=alternative.what,
         evidence=told,
-        remedy=cause.remedy,
+        remedy=alternative.remedy,
     )
 
 
@@ -416,6 +528,7 @@ _ODD = {
     "bend": ("body", "knees or elbows bend the wrong way"),
     "course": ("body", "the person walks sideways or backwards"),
     "slide": ("body", "the foot that stands slides, with {foot_mps:.1f} m/s"),
+    "tread": ("body", "legs go at {legs_over_pace:.1f} times the pace: the standing foot slides"),
     "speed": ("body", "the person is faster than people run: {pace_mps:.1f} m/s"),
     "climb": ("body", "the person rises and falls faster than people do: {climb_mps:.1f} m/s"),
     "above": ("ground", "the person is {above_m:.1f} m above the drones"),

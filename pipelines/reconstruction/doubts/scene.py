@@ -110,6 +110,7 @@ class SceneOfMoments:
     focal_px: Float  # [C]
     sigma: Float  # [C, 6] as `PoseSigma`
     person_px: Float  # [C] height of the person in the pictures, median
+    unposed: Float  # [C] share of a camera's pictures that were taken before or after its log
 
 
 class Sampled(NamedTuple):
@@ -303,7 +304,7 @@ def scene_of(
         pixels: other pixels [F, J, 2] of each camera's pictures.
     """
     cameras = flight.cameras
-    rays, person_px = [], []
+    rays, person_px, unposed = [], [], []
     for index, camera in enumerate(cameras):
         source = cameras[index if order is None else order[index]]
         seen = source.pixels if pixels is None else pixels[index]
@@ -313,6 +314,7 @@ def scene_of(
             since = first + (since - first) * slower[index]
         if late_s is not None:
             since = since + late_s[index] * 1e9
+        unposed.append(_outside(since + flight.t_ns[0], camera, flight.between))
         at = _interpolated(since, seen, (flight.t_ns - flight.t_ns[0]).astype(np.float64))
         rays.append(undistort(at, camera.intrinsics))
         row = at[..., 1]
@@ -325,7 +327,15 @@ def scene_of(
         np.array([(camera.intrinsics.fx + camera.intrinsics.fy) / 2 for camera in cameras]),
         np.array([camera.sigma for camera in cameras]),
         np.nan_to_num(np.array(person_px)),
+        np.array(unposed),
     )
+
+
+def _outside(t_ns: Float, camera: Filmed, between: Interpolation) -> float:
+    """Return the share of times before or after a camera's log; 0 of one that stands still."""
+    logged = camera.camera.trajectory.t_ns
+    beyond = np.maximum(logged[0] - t_ns, t_ns - logged[-1]) > between.max_extrapolation_ns
+    return 0.0 if camera.static else float(beyond.mean())
 
 
 def _poses(flight: Sampled) -> tuple[Float, Float]:
@@ -387,6 +397,14 @@ _SIZE_SIGMA = 0.09
 _WALK_NS = 1_000_000_000
 # Somebody who is slower than this over the flight does not walk.
 _LEAST_PACE_MPS = 0.3
+# The way somebody walks is told by where they are so long before and after.
+_TREAD_NS = 500_000_000
+# In fewer moments, or of somebody slower, the standing foot tells nothing.
+_FEWEST_TREADS, _LEAST_TREAD_MPS = 8, 0.6
+# Ankles that stand roll forwards: legs go at this share of the pace.
+_USUAL_TREAD = 0.88
+# Who rides or slides is rare, and counts at most so much.
+_MOST_TREAD = 3.0
 # People run no faster than this.
 _FASTEST_MPS = 6.0
 # Lying, bending down and cartwheels are rare, and count at most so much.
@@ -571,7 +589,35 @@ class Body:
             "speed": Oddity(max(0.0, fast - 4.0 - 1.5 * noise) / (2 + noise), {"pace_mps": fast}),
             "climb": Oddity(max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2), {"climb_mps": climbed}),
             "slide": Oddity(slides, {"foot_mps": slid}),
+            "tread": self._tread(flight, of_foot),
         }
+
+    def _tread(self, flight: Sampled, noise_mps: float) -> Oddity:
+        """Compare how fast the standing foot is left behind with how fast the person walks.
+
+        It stands still, so both are alike in a world of any scale, but not with a wrong focal length, or at
+        a wrong rate of pictures. Where moments are too far apart to tell the way, nothing is odd.
+        """
+        t_ns, first, second = flight.t_ns, flight.first, flight.second
+        before = np.searchsorted(t_ns, t_ns[first] - _TREAD_NS)
+        after = np.searchsorted(t_ns, t_ns[second] + _TREAD_NS, side="right") - 1
+        way = (self.hips[after] - self.hips[before])[:, :2]
+        way_m, way_s = np.linalg.norm(way, axis=1), (t_ns[after] - t_ns[before]) / 1e9
+        left_m = np.minimum(
+            *(
+                ((self[name][second] - self[name][first])[:, :2] * way).sum(axis=1) / way_m
+                for name in ("left_ankle", "right_ankle")
+            )
+        )
+        pace, legs = way_m / way_s, way_m / way_s - left_m / (STEP_NS / 1e9)
+        known = np.isfinite(legs) & (pace > _LEAST_TREAD_MPS) & (way_s > 3 * STEP_NS / 1e9)
+        if known.sum() < _FEWEST_TREADS:
+            return Oddity(0.0, {})
+        walked = float(pace[known].mean())
+        share = float(legs[known].mean()) / walked
+        sigma = np.hypot(0.15, noise_mps / walked / np.sqrt(known.sum()))
+        off = abs(np.log(max(share, 0.01) / _USUAL_TREAD))
+        return Oddity(min(max(0.0, off - 0.15) / sigma, _MOST_TREAD), {"legs_over_pace": share})
 
     def _ahead(self, flight: Sampled, white_m: float) -> float:
         """Return the cosine of where the person walks, over the flight, against where they face.

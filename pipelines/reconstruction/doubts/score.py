@@ -313,6 +313,10 @@ _ANKLE_ABOVE_GROUND_M = 0.08
 _UNUSED_SIGMAS = 4.0
 # Right flights have less than 0.01 of joints that cannot be used.
 _USUALLY_UNUSED = 0.2
+# Two in three right flights have a smaller share of pictures that outlast their log.
+_UNPOSED_SIGMA = 0.02
+# A log that ends early is no mistake of the description, however early.
+_MOST_UNPOSED = 0.14
 # Ground that no map shows is no steeper than this.
 _SLOPE = 0.3
 # Half of a body is this long: turning it moves its ends by the angle times that.
@@ -382,11 +386,25 @@ def score(
     stature = median(statures)
     if np.isfinite(statures).sum() < 5 or not stature > 0:
         return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
-    odd = _rays(scene, solved, good, misfit) | body.proportions(stature) | body.posture()
+    odd = _rays(solved, good, misfit) | body.proportions(stature) | body.posture()
     odd |= _place(flight, scene, body, solved, stature)
     odd = {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
-    total += sum(float(np.log1p(min(each.sigmas, 50.0) ** 2)) for each in odd.values())
-    return Score(total, misfit, scatter, odd | {"behind": behind}, stature)
+    total += sum(surprise(each) for each in odd.values())
+    return Score(total, misfit, scatter, odd | {"behind": behind, "unposed": unposed(scene)}, stature)
+
+
+def surprise(odd: Oddity) -> float:
+    """Return what an oddity adds to a score: it has heavy tails, and an end."""
+    return float(np.log1p(min(odd.sigmas, 50.0) ** 2))
+
+
+def unposed(scene: SceneOfMoments) -> Oddity:
+    """Measure pictures before or after their camera's log: it is read beside the score, as rays are.
+
+    Whom the pictures show says nothing about it, so it tells other times of all cameras from chance.
+    """
+    share = float(scene.unposed.max())
+    return Oddity(min(share, _MOST_UNPOSED) / _UNPOSED_SIGMA, {"unposed_share": share})
 
 
 def base_of(flight: Sampled, scene: SceneOfMoments) -> tuple[Base, Score]:
@@ -408,8 +426,8 @@ def _misfit(solved: SolvedJoints, good: Bool) -> float:
     return float(np.sqrt(total / good.sum()))
 
 
-def _rays(scene: SceneOfMoments, solved: SolvedJoints, good: Bool, misfit: float) -> dict[str, Oddity]:
-    """Measure joints that gates reject, the best pair's angle, and pictures of people without a pose."""
+def _rays(solved: SolvedJoints, good: Bool, misfit: float) -> dict[str, Oddity]:
+    """Measure joints that gates reject, and the best pair's angle."""
     freedom = 2 * solved.views[good] - 3
     gate = (_UNUSED_SIGMAS * max(misfit, 1.0)) ** 2
     unused = float((solved.chi2[good] > gate * freedom).mean())
@@ -419,14 +437,11 @@ def _rays(scene: SceneOfMoments, solved: SolvedJoints, good: Bool, misfit: float
         if both.any():
             cosine = (solved.direction[one][both] * solved.direction[other][both]).sum(axis=-1)
             sine = max(sine, median(np.sqrt(np.maximum(0.0, 1.0 - cosine**2))))
-    found = np.isfinite(scene.rays[..., 0]).any(axis=-1)
-    unposed = float((found & ~np.isfinite(scene.position).all(axis=-1)).mean(axis=1).max())
     return {
         "parallax": Oddity(
             max(0.0, 0.1 / max(sine, 1e-4) - 1), {"parallax_deg": float(np.degrees(np.arcsin(sine)))}
         ),
         "unused": Oddity(max(0.0, unused - _USUALLY_UNUSED) / 0.05, {"unused_share": unused}),
-        "unposed": Oddity(min(0.2, unposed) / 0.05, {"unposed_share": unposed}),
     }
 
 
