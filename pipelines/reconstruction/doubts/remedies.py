@@ -9,6 +9,7 @@ from typing import Any, Protocol, get_args
 
 import numpy as np
 from ruamel.yaml import YAML
+from ruamel.yaml.util import load_yaml_guess_indent
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics
@@ -289,28 +290,17 @@ def own_origins(cameras: Sequence[_Filming], shifts: Float) -> str:
     return "; ".join(origin(cameras, index, shifts[index]) for index in moved)
 
 
-# Mappings and sequences are indented by one of these (mapping, sequence, dash), as manifests are written.
-_INDENTS = ((2, 2, 0), (2, 4, 2), (4, 4, 2), (4, 4, 0))
-
-
 def mended(text: str, remedy: str) -> str | None:
     """Put the lines of a remedy into the text of a manifest, with its comments; None if they are no lines."""
-    candidates = []
-    for mapping, sequence, offset in _INDENTS:
-        yaml = YAML()
-        yaml.preserve_quotes, yaml.width = True, 10_000
-        yaml.indent(mapping=mapping, sequence=sequence, offset=offset)
-        document, plain = yaml.load(text), StringIO()
-        yaml.dump(document, plain)
-        if not _are_set(document, remedy):
-            return None
-        written = StringIO()
-        yaml.dump(document, written)
-        same = sum(
-            one == other for one, other in zip(plain.getvalue().split("\n"), text.split("\n"), strict=False)
-        )
-        candidates.append((same, written.getvalue()))
-    return max(candidates, key=lambda each: each[0])[1]
+    _, mapping, offset = load_yaml_guess_indent(text)
+    yaml, written = YAML(), StringIO()
+    yaml.preserve_quotes, yaml.width = True, 10_000
+    yaml.indent(mapping=mapping, sequence=mapping, offset=offset)
+    document = yaml.load(text)
+    if not _are_set(document, remedy):
+        return None
+    yaml.dump(document, written)
+    return written.getvalue()
 
 
 def _are_set(document: Any, remedy: str) -> bool:
