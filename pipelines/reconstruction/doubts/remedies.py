@@ -11,8 +11,7 @@ import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.util import load_yaml_guess_indent
 
-from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.mounting import Looks, body_from_camera
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.session.description import CameraEntry, PosesEntry
