@@ -112,7 +112,8 @@ def tried(own: Described, mistake: Mistake, right: float) -> Outcome:
     mended = after is not None and after <= 1.1 * right
     misfits = first["evidence"].get("tried", {}) if first else {}
     raised = misfits.get("misfit_after", 0.0) > misfits.get("misfit_before", 0.0)
-    worse = raised or (remedied and error is not None and (after is None or after > 1.05 * error))
+    grown = remedied and error is not None and (after is None or after > 1.05 * error)
+    worse = raised or (grown and not mended)
     counts = error is None or error > 1.2 * right
     verdict = ("yes" if named else "NO") if counts else f"({'yes' if named else 'no'})"
     said = f"{first['code']}: {first['what']}" if first else (stopped or "nothing")
