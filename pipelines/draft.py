@@ -43,7 +43,7 @@ from pipelines.formats.logs.positions import FIXES, pairs_of
 from pipelines.formats.logs.trajectories import attitudes_of, poses_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import FolderPictures
-from pipelines.formats.videos.video import VideoReader, created_ns, index_video
+from pipelines.formats.videos.video import FORMAT, VideoReader, created_ns
 from pipelines.geometry.arrays import Float, Int64, Place, RelativeTo
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera, level_heading
@@ -529,7 +529,7 @@ def _followed_points(path: Path) -> TrackedPoints:
     """Follow points through the first pictures of a video, each for a fifth of a second."""
     import cv2
 
-    index = index_video(path)
+    index = FORMAT.index(path)
     pts_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
     height = round(index.height * WATCHED_WIDTH_PX / index.width)
     follower = Follower()

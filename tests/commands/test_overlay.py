@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.export import export
-from pipelines.formats.videos.video import VideoReader, index_video
+from pipelines.formats.videos.video import FORMAT, VideoReader
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.poses import conjugate, rotate
 from pipelines.ingest import ingest
@@ -114,7 +114,7 @@ def test_joints_are_drawn_where_they_are_seen_in_every_picture(
     result = export(session, ["overlay"])
     assert [path.name for path in result.written] == ["drone1.overlay.mp4", "drone2.overlay.mp4"]
     for video, stamps in zip(result.written, (flight.t_ns - START_NS, STEPS_NS), strict=True):
-        index = index_video(video)
+        index = FORMAT.index(video)
         assert np.abs(index.pts_ns - stamps).max() <= 12_000  # a tick of 1/90000 s
         assert (index.width, index.height) == (LENS.width, LENS.height)
         name = video.name.partition(".")[0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.film import FilmSettings, film, film_settings
-from pipelines.formats.videos.video import index_video
+from pipelines.formats.videos.video import FORMAT
 from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
@@ -53,7 +53,7 @@ def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
     assert filmed["mpjpe_mm"] == filmed["common_mpjpe_mm"] < FIRST_MM
     assert filmed["fallback"] is not None, "auto needs more than four moments"
     folder = session / "film" / "fixed"
-    assert len(index_video(folder / "drone1.mp4").pts_ns) == 4
+    assert len(FORMAT.index(folder / "drone1.mp4").pts_ns) == 4
     assert (folder / "skeleton.parquet").is_file()
 
     replanned = read_json(session / "replan" / "stage.json")

@@ -192,15 +192,6 @@ def _position(
         "gps": log.first(["GPS"], instance, "I"),
     }
     found = {kind: rows for kind, rows in there.items() if rows is not None}
-    if instance and (choice.position or "local") not in found:
-        wanted = f"{choice.position} position" if choice.position else "local position"
-        others = [kind for kind in found if kind != choice.position]
-        raise DataError(
-            log.path,
-            f"has no instance {instance} of a {wanted}",
-            f"write position: {others[0]}" if others else "leave `instance` out",
-            code="no-such-name",
-        )
     lacking = "has no POS, XKF1, NKF1 or GPS message"
     require_position(log.path, found, choice.position, lacking, "log them (LOG_BITMASK)")
     kind: str = choice.position or next(iter(found))
@@ -211,7 +202,8 @@ def _position(
         dropped["cut off"] = dropped.get("cut off", 0) + rows.lost
     if kind == "local":
         enu = rows.numbers("PE", "PN", "PD") * [1, 1, -1]
-        origin = _estimators_origin(log)
+        placed = log.first(["ORGN"], 0, "Type")  # type 0 is the origin of the estimator's metres
+        origin = None if placed is None else Place(*placed.numbers("Lat", "Lng", "Alt")[0].tolist())
         return position_track(log.path, rows.name, rows.t_ns(), enu, dropped, on_earth=False, origin=origin)
     values = rows.numbers("Lat", "Lng", "Alt")
     fixed = rows.numbers("Status") >= _3D_FIX if kind == "gps" else np.ones(len(rows), dtype=np.bool_)
@@ -221,12 +213,6 @@ def _position(
         return track
     across, up = np.median(accuracy.numbers("HAcc", "VAcc"), axis=0).tolist()
     return replace(track, accuracy_m=(across / float(np.sqrt(2)), up))
-
-
-def _estimators_origin(log: _DataFlash) -> Place | None:
-    """Return the origin of the estimator's metres (ORGN of type 0); None without one."""
-    rows = log.first(["ORGN"], 0, "Type")
-    return None if rows is None else Place(*rows.numbers("Lat", "Lng", "Alt")[0].tolist())
 
 
 def _body(log: _DataFlash, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:

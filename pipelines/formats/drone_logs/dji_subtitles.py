@@ -372,7 +372,7 @@ def _rows(subtitles: Subtitles) -> DjiRows:
         t_ns,
         timed,
         columns,
-        _clock_name(subtitles),
+        "the drone's clock" if subtitles.has_clock.any() else "the video's start",
         body=_angles(columns, "drone"),
         gimbal=_angles(columns, "gb"),
         names=("F.PRY", "its gimbal angles"),
@@ -421,10 +421,6 @@ def _angles(columns: Mapping[str, Float], part: str) -> Float:
     return np.stack(
         [yaw, pitch, np.where(np.isnan(roll), np.where(np.isnan(yaw), np.nan, 0.0), roll)], axis=1
     )
-
-
-def _clock_name(subtitles: Subtitles) -> str:
-    return "the drone's clock" if subtitles.has_clock.any() else "the video's start"
 
 
 def _note_on_clock(subtitles: Subtitles) -> str:

@@ -122,14 +122,15 @@ def _position(
     dropped: MutableMapping[str, int],
     notes: list[str],
 ) -> PositionTrack:
-    there = {
-        kind: _instance(path, topics, names, choice, wanted=choice.position == kind)
-        for kind, names in _POSITIONS.items()
-    }
-    found = {kind: topic for kind, topic in there.items() if topic is not None}
-    every = [topic for names in _POSITIONS.values() for topic in _there(topics, names)]
-    if not found and choice.instance is not None and every:
-        raise _no_instance(path, choice.instance, "a position", every)
+    there = {kind: _there(topics, names) for kind, names in _POSITIONS.items()}
+    found = {kind: each[0] for kind, each in there.items() if each}
+    if choice.instance is not None:
+        chosen = {kind: [t for t in each if t.instance == choice.instance] for kind, each in there.items()}
+        listed = ", ".join(f"{topic.name} {topic.instance}" for each in there.values() for topic in each)
+        found = {kind: each[-1] for kind, each in chosen.items() if each}
+        if listed and (choice.position not in found if choice.position else not found):
+            problem = f"has no instance {choice.instance} of {choice.position or 'a'} position"
+            raise DataError(path, problem, f"there are {listed}", code="no-such-name")
     require_position(
         path,
         found,
@@ -137,7 +138,9 @@ def _position(
         "has no vehicle_local_position, vehicle_global_position or GPS",
         "log them (SDLOG_PROFILE), or give the poses from elsewhere",
     )
-    kind = choice.position or _likeliest(found)
+    ever = {"local": _local_is_valid, "gps": lambda topic: _fixes(topic)[1], "global": lambda _: np.ones(1)}
+    likely = (kind for kind, topic in found.items() if ever[kind](topic).any())
+    kind: str = choice.position or next(likely, next(iter(found)))
     topic = found[kind]
     notes.append(f"took the {kind} position from {topic}")
     if kind == "local":
@@ -148,17 +151,6 @@ def _position(
         values, usable = _fixes(topic)
     track = fixes_track(path, topic.title, topic.t_ns(), values, usable, dropped)
     return replace(track, accuracy_m=_accuracy(topic, usable))
-
-
-def _likeliest(found: Mapping[str, UlogTopic]) -> str:
-    """Choose the estimator's local position if it is ever valid, else a position on Earth."""
-    if "local" in found and _local_is_valid(found["local"]).any():
-        return "local"
-    if "global" in found:
-        return "global"
-    if "gps" in found and _fixes(found["gps"])[1].any():
-        return "gps"
-    return next(iter(found))
 
 
 def _local(
@@ -173,7 +165,8 @@ def _local(
             " drone was held in place"
         )
         valid = np.ones(len(topic), dtype=np.bool_)
-    if (resets := _resets(topic, valid)) > 0:
+    resets = np.count_nonzero(np.diff(topic.numbers("xy_reset_counter")[valid]) > 0)
+    if resets:
         notes.append(f"the estimator moved its position {resets} times at once (xy_reset_counter)")
     references, stated = topic.numbers("ref_lat", "ref_lon", "ref_alt"), topic.flags("xy_global")
     stated &= np.isfinite(references).all(axis=1) & (references[:, :2] != 0).any(axis=1)
@@ -198,13 +191,6 @@ def _local(
 
 def _local_is_valid(topic: UlogTopic) -> Bool:
     return topic.flags("xy_valid") & topic.flags("z_valid")
-
-
-def _resets(topic: UlogTopic, valid: Bool) -> int:
-    if "xy_reset_counter" not in topic:
-        return 0
-    counter = topic.numbers("xy_reset_counter")[valid]
-    return int(np.count_nonzero(np.diff(counter)))
 
 
 def _fixes(topic: UlogTopic) -> tuple[Float, Bool]:
@@ -250,19 +236,13 @@ def _gimbal(
     dropped: MutableMapping[str, int],
     notes: list[str],
 ) -> AttitudeTrack | None:
-    """Read the gimbal's own attitude."""
-    devices = sorted(_there(topics, ["gimbal_device_attitude_status"]), key=lambda topic: topic.instance)
-    if devices:
-        if len(devices) > 1:
-            notes.append(f"has {len(devices)} gimbals: took the angles of the first, {devices[0].instance}")
-        return _gimbal_device(devices[0], body, dropped)
-    return None
-
-
-def _gimbal_device(
-    topic: UlogTopic, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
-) -> AttitudeTrack | None:
     """Read GIMBAL_DEVICE_ATTITUDE_STATUS: pitch and roll against the horizon, yaw by its flags (MAVLink)."""
+    devices = _there(topics, ["gimbal_device_attitude_status"])
+    if not devices:
+        return None
+    topic = devices[0]
+    if len(devices) > 1:
+        notes.append(f"has {len(devices)} gimbals: took the angles of the first, {topic.instance}")
     stated = topic.numbers("q[1]", "q[2]", "q[3]", "q[0]")
     flags = np.asarray(topic.columns.get("device_flags", np.zeros(len(topic)))).astype(np.int64)
     framed = (flags & (_YAW_IN_VEHICLE | _YAW_IN_EARTH)) != 0
@@ -287,34 +267,9 @@ def _gps_time(topics: Sequence[UlogTopic]) -> ClockFit | None:
     return None
 
 
-def _instance(
-    path: Path | str,
-    topics: Sequence[UlogTopic],
-    names: Sequence[str],
-    choice: TelemetryChoice,
-    *,
-    wanted: bool,
-) -> UlogTopic | None:
-    """Return the topic of the chosen instance, the first by default; None if there is none."""
-    of_kind = _there(topics, names)
-    if not of_kind or choice.instance is None:
-        return of_kind[0] if of_kind else None
-    found = [topic for topic in of_kind if topic.instance == choice.instance]
-    if not found and wanted:
-        raise _no_instance(path, choice.instance, names[0], of_kind)
-    return found[-1] if found else None
-
-
 def _there(topics: Sequence[UlogTopic], names: Sequence[str]) -> list[UlogTopic]:
     """Return the topics with these names that hold messages."""
     return [topic for name in names for topic in topics if topic.name == name and len(topic)]
-
-
-def _no_instance(path: Path | str, instance: int, what: str, there: Sequence[UlogTopic]) -> DataError:
-    listed = ", ".join(f"{topic.name} {topic.instance}" for topic in there)
-    return DataError(
-        path, f"has no instance {instance} of {what}", f"there are {listed}", code="no-such-name"
-    )
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,8 @@ class _Bag(ChunkedPart):
                 if kind == _INDEX and self.chunks:
                     self.take_index(self._index_rows(fields, data_at, length))
                 elif kind == _CONNECTION:
-                    self._take_connection(fields, self.bytes_at(data_at, length))
+                    number, channel = _connection(fields, self.bytes_at(data_at, length))
+                    self.channels.setdefault(number, channel)
             except (struct.error, ValueError, KeyError, IndexError):
                 break
             position = end
@@ -145,10 +146,6 @@ class _Bag(ChunkedPart):
         compression = fields[b"compression"].decode()
         here = min(length, self.file_size - data_at)
         self.take_chunk(Chunk(data_at, here, compression, _U32.unpack(fields[b"size"])[0], cut=here < length))
-
-    def _take_connection(self, fields: Fields, data: bytes) -> None:
-        number, channel = _connection(fields, data)
-        self.channels.setdefault(number, channel)
 
     def _index_rows(self, fields: Fields, data_at: int, length: int) -> Int64:
         raw = np.frombuffer(self.bytes_at(data_at, length - length % _INDEX_ROW.itemsize), _INDEX_ROW)

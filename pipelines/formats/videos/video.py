@@ -126,21 +126,17 @@ class VideoContainer:
         }
 
     def index(self, path: Path) -> VideoIndex:
-        """Return the index of `index_video`."""
-        return index_video(path)
+        """Read the time at which each frame is shown, from the container; only the first picture is decoded.
 
-
-def index_video(path: Path) -> VideoIndex:
-    """Read the time at which each frame is shown, from the container; only the first picture is decoded.
-
-    The largest video stream is used. Cover pictures do not count, nor frames that an edit list hides or that
-    VP8 and VP9 code for reference only. pts_ns[k] is the stamp of frame k less that of frame 0, rounded to a
-    nanosecond once; those of equal stamps are spread up to the next. Counted in `dropped`: "cut off" (frames
-    in the table after the end of the file; also the last ones shown later than the first lost one, as their
-    numbers are unknown), "no stamp", "before the first frame that can be decoded".
-    """
-    with VideoReader(path) as reader:
-        return reader.index
+        The largest video stream is used. Cover pictures do not count, nor frames that an edit list hides or
+        that VP8 and VP9 code for reference only. pts_ns[k] is the stamp of frame k less that of frame 0,
+        rounded to a nanosecond once; those of equal stamps are spread up to the next. Counted in `dropped`:
+        "cut off" (frames in the table after the end of the file; also the last ones shown later than the
+        first lost one, as their numbers are unknown), "no stamp", "before the first frame that can be
+        decoded".
+        """
+        with VideoReader(path) as reader:
+            return reader.index
 
 
 def created_ns(path: Path) -> int | None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.videos import video
-from pipelines.formats.videos.video import VideoReader, created_ns, frames, index_video
+from pipelines.formats.videos.video import VideoReader, created_ns, frames
 from pipelines.geometry.arrays import Picture
 from pipelines.session.recognition import recognise
 from pipelines.session.records import UNTIMED
@@ -60,7 +60,7 @@ def decoded_by_opencv(path: Path) -> tuple[list[Picture], list[float]]:
 @pytest.mark.parametrize("ticks", [even_ticks(40), uneven_ticks(40)], ids=["constant", "variable"])
 def test_stamps_are_those_written(tmp_path: Path, ticks: list[int], b_frames: int) -> None:
     path = write_video(tmp_path / "v.mp4", ticks, b_frames=b_frames)
-    index = index_video(path)
+    index = READER.index(path)
     assert index.pts_ns.tolist() == relative_ns(ticks)
     assert index.start_ns == 0
     assert index.variable == (ticks == uneven_ticks(40))
@@ -144,7 +144,7 @@ def test_a_hundred_random_reads_equal_decoding_in_order(tmp_path: Path, name: st
 def test_pictures_are_opencvs(tmp_path: Path, turned_deg: int) -> None:
     path = write_video(tmp_path / "v.mp4", uneven_ticks(30), turned_deg=turned_deg)
     pictures, milliseconds = decoded_by_opencv(path)
-    index = index_video(path)
+    index = READER.index(path)
     assert index.rotation_deg == turned_deg
     assert (index.width, index.height) == (SIZE if turned_deg % 180 == 0 else SIZE[::-1])
     # OpenCV gives milliseconds as a float64 of seconds.
@@ -233,7 +233,7 @@ def test_more_containers_that_ffmpeg_reads(tmp_path: Path, suffix: str, codec: s
     except (av.error.FFmpegError, ValueError) as error:
         pytest.skip(f"this FFmpeg does not write {suffix} ({error})")
     assert recognise(path, VideoFormat, "video").name == "video"
-    index = index_video(path)
+    index = READER.index(path)
     np.testing.assert_allclose(np.diff(index.pts_ns), 1e9 / 30, atol=1e6)
     assert [read_bar_code(picture) for _, picture in frames(path)] == list(range(index.count))
     assert index.count in {11, 12}  # a container may lose the length of its last picture
@@ -333,7 +333,7 @@ def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
     at = content.index(unit, content.index(unit) + 1)
     path.write_bytes(content[:at] + (-(1 << 16)).to_bytes(4, signed=True) + content[at + 4 :])
     with refused("unsupported", path):
-        index_video(path)
+        READER.index(path)
 
 
 # --- registry and real recordings -------------------------------------------------------------------------
