@@ -1,4 +1,4 @@
-"""COLMAP models: a folder with cameras, images and points as .txt or .bin, read by pycolmap.
+"""COLMAP models: a folder with cameras and images as .txt or .bin, read by pycolmap.
 
 pycolmap reads on behind the end of a damaged file, for ever or into wrong numbers. So it runs in a process of
 its own with limits of time and memory, and writes the model again: what was read whole has the same size.
@@ -30,9 +30,9 @@ from pipelines.session.records import CalibratedCamera
 READING_TIMEOUT_S = 20.0
 # Slow disks and machines read that much; a larger file gets the time on top.
 _SLOWEST_READING_BYTES_PER_S = 2e6
-# Points need up to ten times their size in the file; damaged counts ask for terabytes.
+# Images need up to ten times their size in the file; damaged counts ask for terabytes.
 _MEMORY_BYTES, _MEMORY_PER_BYTE = 4 << 30, 20
-_FILES = ("cameras", "images", "points3D")
+_FILES = ("cameras", "images")
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class ColmapModel:
 
     def recognises(self, path: Path) -> bool:
         """Return True if a folder holds cameras and images, both as text or both binary."""
-        return any(_stored(path, suffix, _FILES[:2]) for suffix in (".bin", ".txt"))
+        return any(_stored(path, suffix) for suffix in (".bin", ".txt"))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe every image's camera."""
@@ -78,7 +78,7 @@ class ColmapModel:
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
         """Read the camera and pose of every image; binary files before text, as COLMAP does."""
-        if not any(_stored(path, suffix, _FILES) for suffix in (".bin", ".txt")):
+        if not self.recognises(path):
             problem = f"lacks one of {', '.join(_FILES)}, all as .bin or all as .txt"
             raise DataError(path, problem, "name the folder with the whole COLMAP model")
         cameras, images = _read(path)
@@ -92,8 +92,8 @@ class ColmapModel:
         return found
 
 
-def _stored(path: Path, suffix: str, names: tuple[str, ...]) -> bool:
-    return all((path / f"{name}{suffix}").is_file() for name in names)
+def _stored(path: Path, suffix: str) -> bool:
+    return all((path / f"{name}{suffix}").is_file() for name in _FILES)
 
 
 def _named(path: Path, images: dict[str, Any]) -> dict[str, Any]:
@@ -149,14 +149,22 @@ def _read_here(path: Path, memory: int) -> dict[str, Any]:
 
     with suppress(ValueError):  # of systems without such a limit
         resource.setrlimit(resource.RLIMIT_AS, (memory, resource.RLIM_INFINITY))
-    suffix = next(each for each in (".bin", ".txt") if _stored(path, each, _FILES))
-    model = pycolmap.Reconstruction(str(path))
+    suffix = next(each for each in (".bin", ".txt") if _stored(path, each))
     with tempfile.TemporaryDirectory() as folder:
-        (model.write_binary if suffix == ".bin" else model.write_text)(folder)
-        for name in _FILES[:2]:
-            stored, again = (_content(Path(each) / f"{name}{suffix}") for each in (path, folder))
-            if stored != again:
-                return {"error": f"{name}{suffix} is cut off or damaged: {stored} in place of {again}"}
+        copy, again = Path(folder) / "copy", Path(folder) / "again"
+        copy.mkdir()
+        again.mkdir()
+        for name in (*_FILES, "rigs", "frames"):
+            if (path / f"{name}{suffix}").is_file():
+                (copy / f"{name}{suffix}").symlink_to((path / f"{name}{suffix}").resolve())
+        # Points are not used, and a damaged count of them asks for terabytes.
+        (copy / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        model = pycolmap.Reconstruction(str(copy))
+        (model.write_binary if suffix == ".bin" else model.write_text)(again)
+        for name in _FILES:
+            stored, written = (_content(each / f"{name}{suffix}") for each in (path, again))
+            if stored != written:
+                return {"error": f"{name}{suffix} is cut off or damaged: {stored} in place of {written}"}
     cameras = {
         number: (camera.model.name, (camera.width, camera.height), camera.params.tolist())
         for number, camera in model.cameras.items()

@@ -138,7 +138,7 @@ def _position(
         "has no vehicle_local_position, vehicle_global_position or GPS",
         "log them (SDLOG_PROFILE), or give the poses from elsewhere",
     )
-    ever = {"local": _local_is_valid, "gps": lambda topic: _fixes(topic)[1], "global": lambda _: np.ones(1)}
+    ever = {"local": _local_is_valid, "gps": lambda t: _fixes(t)[1], "global": UlogTopic.t_ns}
     likely = (kind for kind, topic in found.items() if ever[kind](topic).any())
     kind: str = choice.position or next(likely, next(iter(found)))
     topic = found[kind]

@@ -98,7 +98,7 @@ def test_a_real_model() -> None:
     assert (lens.width, lens.height, lens.fx, lens.cx, lens.model) == (1919, 1079, 1847.53, 959.0, "none")
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
 def test_a_binary_model_that_is_cut_off_or_states_wrong_counts_is_refused(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
