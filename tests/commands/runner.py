@@ -13,10 +13,12 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 from mocap_cli.main import print_error, run
 from pipelines.session.errors import CODES, MocapError
+from tests.synthetic.flights import SyntheticFlight
 
 MOCAP = str(Path(sys.executable).with_name("mocap"))
 
@@ -73,6 +75,23 @@ def succeeds(*arguments: str | Path) -> str:
     done = mocap(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def result_of(*arguments: str | Path) -> dict[str, Any]:
+    """Run a command that must succeed with --json; return what it prints."""
+    result: dict[str, Any] = json.loads(succeeds(*arguments, "--json"))
+    return result
+
+
+def ingested(flight: SyntheticFlight) -> Path:
+    """Ingest a flight; return its session, which lies beside it."""
+    succeeds("ingest", flight.manifest)
+    return flight.manifest.with_suffix(".session")
+
+
+def measured(session: Path, *options: str) -> dict[str, Any]:
+    """Reconstruct by `robust`; return the metrics."""
+    return result_of("reconstruct", session, "--method", "robust", *options)
 
 
 def refused(*arguments: str | Path, code: str | None = None) -> str:

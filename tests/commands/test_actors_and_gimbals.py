@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, quaternion_from_rotation_vector, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
-from tests.commands.runner import mocap, refused, succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import ingested, measured, mocap, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, bystander_at, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
@@ -70,17 +70,16 @@ def test_the_logged_actor_decides_who_it_is(tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
     actor = pd.read_parquet(tmp_path / "flight.session" / "actor.parquet")
     assert list(actor["t_ns"]) == list(flight.t_ns)
-    result = json.loads(succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust", "--json"))
+    result = measured(tmp_path / "flight.session")
     assert result["mpjpe_mm"] < 0.5
 
 
 def test_several_logged_people_are_reconstructed_under_their_names(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=3, bystander=True, clean=True)
     write_actors(flight, tmp_path)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
+    session = ingested(flight)
     succeeds("reconstruct", session, "--method", "robust")
-    metrics = json.loads((session / "reconstruct" / "metrics.json").read_text())
+    metrics = read_json(session / "reconstruct" / "metrics.json")
     assert metrics["people"]["names"] == ["abe", "zoe"]
     assert list(metrics["by_person"]) == ["abe", "zoe"]
     assert metrics["by_person"]["zoe"]["coverage"] == 1
@@ -167,13 +166,13 @@ def test_a_floor_plan_is_read_again_when_its_picture_changes(tmp_path: Path) -> 
     flight.save()
     succeeds("ingest", flight.manifest)
     stored = tmp_path / "flight.session" / "session.json"
-    assert json.loads(stored.read_text(encoding="utf-8"))["map"]["occupied"] == 0
+    assert read_json(stored)["map"]["occupied"] == 0
     assert "unchanged" in succeeds("ingest", flight.manifest)
     picture[2, 3] = 0
     cv2.imwrite(str(tmp_path / "site.png"), picture)
     done = mocap("ingest", flight.manifest)
     assert "written" in done.stdout
-    described = json.loads(stored.read_text(encoding="utf-8"))["map"]
+    described = read_json(stored)["map"]
     assert described["occupied"] == described["shape"][2]
 
 
@@ -216,7 +215,7 @@ def test_what_the_logs_of_a_gimbal_and_an_actor_lose_is_counted(tmp_path: Path) 
     flight.save()
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0, done.stderr
-    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    stored = read_json(tmp_path / "flight.session" / "session.json")
     no_fix, not_finite = stored["actor"]["dropped"].items()
     assert (no_fix[1], not_finite[1]) == (3, 1)
     assert stored["actor"]["count"] == len(flight.t_ns) - 4

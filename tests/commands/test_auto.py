@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
 
-from tests.commands.runner import mocap, succeeds
+from tests.commands.runner import ingested, mocap, result_of, succeeds
 from tests.real_data import fetch_networks
 from tests.synthetic.flights import write_flight
 
@@ -19,14 +18,13 @@ NOISE = {"white": {"position_m": 0.2, "rotation_deg": 0.7}}
 
 def reconstructed(session: Path, *options: str) -> tuple[dict[str, Any], bytes]:
     """Reconstruct; return the metrics and the bytes of the skeleton."""
-    metrics: dict[str, Any] = json.loads(succeeds("reconstruct", session, *options, "--json"))
+    metrics = result_of("reconstruct", session, *options)
     return metrics, (session / "reconstruct" / "skeleton.parquet").read_bytes()
 
 
 def test_without_pictures_it_is_the_refinement(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=3, seconds=1.5, fps=15, pose_noise=NOISE)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
+    session = ingested(flight)
     unasked, skeleton = reconstructed(session)
     refined, of_refined = reconstructed(session, "--method", "refined")
     assert skeleton == of_refined
@@ -46,8 +44,7 @@ def test_what_motion_and_bones_cannot_serve_is_left_to_robust(tmp_path: Path, st
     for camera in flight.settings["cameras"].values():
         del camera["pose_noise"]
     flight.save()
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
+    session = ingested(flight)
     unasked, skeleton = reconstructed(session)
     _, of_robust = reconstructed(session, "--method", "robust")
     assert skeleton == of_robust
@@ -66,8 +63,7 @@ def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path, me
     # Stamped 200 ms too early: at 1.2 m/s 240 mm beside one of two cameras; keypoints err by 26 mm.
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.2, "sigma_s": 0.2}
     flight.save()
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
+    session = ingested(flight)
     metrics, _ = reconstructed(session, "--method", method)
     # 17 joints in 90 frames determine it to about 2 ms: two and a half of those.
     assert abs(metrics["clock_offsets_s"]["drone2"] - 0.2) < 0.005
@@ -90,8 +86,7 @@ def test_a_stated_clock_that_is_wrong_is_moved_and_doubted(
     for name, seconds in late_s.items():
         flight.settings["cameras"][name]["clock"]["offset_s"] = -seconds
     flight.save()
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
+    session = ingested(flight)
     metrics, _ = reconstructed(session)
     moved = metrics.get("clocks_moved", {})
     assert moved.keys() == late_s.keys()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
 from pipelines.session.stages import COMMANDS
 from pipelines.session.storage import read_json
-from tests.commands.runner import content, refused, succeeds
+from tests.commands.runner import content, ingested, refused, result_of, succeeds
 from tests.commands.test_overlay import filmed_flight
 from tests.keypoints.spotted_flights import spot_detector, write_pictures, write_spotted_flight
 from tests.synthetic.flights import write_flight
@@ -84,10 +83,10 @@ def test_an_exchanged_video_is_refused_until_it_is_ingested_and_its_keypoints_go
     for source in flight.iterdir():
         if source.is_file():
             shutil.copy2(source, fresh)
-    described = json.loads(succeeds("info", session, "--json"))["readings"][0]
+    described = result_of("info", session)["readings"][0]
     for folder in (fresh, flight):
         succeeds("ingest", folder / "flight.yaml")
-    told = json.loads(succeeds("info", session, "--json"))["readings"][0]
+    told = result_of("info", session)["readings"][0]
     assert told["detect"] != described["detect"], "its tables are those of before, its pictures are not"
     for folder in (fresh, flight):
         assert "written" in succeeds(*again(folder))
@@ -272,8 +271,7 @@ def test_a_changed_table_of_ingest_is_refused_by_all_until_ingest_makes_it_anew(
 
 def test_a_changed_replay_is_neither_shown_nor_filmed(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=1.5, clean=True)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
+    session = ingested(flight)
     succeeds("reconstruct", session, "--method", "robust")
     compare = ("replan-compare", session, "--arms", "fixed", "--trials", "1")
     succeeds(*compare)

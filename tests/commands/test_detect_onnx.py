@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from pipelines.session.registries import need
+from pipelines.session.storage import read_json
 from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import FPS, person_at, spot_detector, write_spotted_flight
 
@@ -30,7 +31,7 @@ def test_keypoints_of_the_users_model_become_a_skeleton(tmp_path: Path) -> None:
     # video's quantisation; a pixel is 2 cm, and depth errs by 1 / sin(31 deg) = 1.9 times as much.
     assert np.linalg.norm(found - truth, axis=-1).max() < 0.1 * 0.6 * 2 * 0.02 * 1.9 * np.sqrt(3)
 
-    stage = json.loads((session / "detect" / "stage.json").read_text(encoding="utf-8"))
+    stage = read_json(session / "detect" / "stage.json")
     assert str(tmp_path) not in json.dumps(stage)
     # The models may move, and the detector does not run again.
     moved = tmp_path / "elsewhere"
@@ -91,6 +92,6 @@ def test_another_provider_detects_anew_and_one_that_is_not_there_is_refused(tmp_
 
 def provider(session: Path) -> str:
     """Return the provider that the stage says ran the models."""
-    stage = json.loads((session / "detect" / "stage.json").read_text(encoding="utf-8"))
+    stage = read_json(session / "detect" / "stage.json")
     stated = dict(option.split("=", 1) for option in stage["settings"]["detector"][len("onnx:") :].split(","))
     return str(stated["provider"])

@@ -12,7 +12,7 @@ from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.stages import StageRecord, locked
-from tests.commands.runner import mocap, refused, succeeds
+from tests.commands.runner import ingested, mocap, refused
 from tests.keypoints.spotted_flights import CAMERAS, FPS, spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
 
@@ -67,8 +67,7 @@ def test_pictures_that_cannot_be_decoded_are_spoken_of(
 
 def test_a_span_without_pictures_to_look_at_is_refused(tmp_path: Path) -> None:
     flight = write_flight(tmp_path)
-    succeeds("ingest", flight.manifest)
-    session = flight.manifest.with_suffix(".session")
+    session = ingested(flight)
     assert "--pictures" in refused("reconstruct", session, "--method", "robust", "--pictures", "1:")
     done = mocap("reconstruct", session, "--method", "robust", "--pictures", "::3")
     assert done.returncode == 0

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +12,7 @@ import pytest
 from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.session.registries import find_detector
 from pipelines.session.tables import motion_from
-from tests.commands.runner import content, mocap_process, refused, succeeds
+from tests.commands.runner import content, measured, mocap_process, refused, succeeds
 from tests.real_data import real_data
 
 EVERY = 20
@@ -47,9 +45,7 @@ def flight(tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_detector_and_triangulation_agree_with_the_peers_skeleton(flight: Path) -> None:
     session = flight.with_suffix(".session")
-    result: dict[str, Any] = json.loads(
-        succeeds("reconstruct", session, "--method", "robust", "--pictures", f"::{EVERY}", "--json")
-    )
+    result = measured(session, "--pictures", f"::{EVERY}")
     assert result["reconstructed_share"] > 0.95
     peer = TRC.read_joints(real_data("pose2sim_single/pose-3d/single_0-99.trc"), unit=None, axes=None)
     ours = motion_from(pd.read_parquet(session / "reconstruct" / "skeleton.parquet"), peer.joints)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,13 @@ from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
+from pipelines.session.storage import read_json
 from tests.commands.runner import succeeds
 from tests.synthetic.drone_logs import (
     HOME,
     LEVER_ARM,
     DroneTruth,
     drone_of,
-    tlog_pictures,
     ulog_rows,
     write_dataflash,
     write_record,
@@ -44,8 +43,7 @@ ON_GIMBAL = {"looks": "forward", "translation": LEVER_ARM.tolist()}
 
 def session_of(flight: SyntheticFlight) -> dict[str, Any]:
     stored = flight.manifest.with_suffix(".session") / "session.json"
-    described: dict[str, Any] = json.loads(stored.read_text(encoding="utf-8"))
-    return described
+    return read_json(stored)
 
 
 def poses_of(flight: SyntheticFlight, name: str) -> pd.DataFrame:
@@ -163,42 +161,6 @@ def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"file": f"{name}.tlog"}
 
 
-def _airsim(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
-    """Write odometry as AirSim's node does: position in NED, and the rotation of an FRD body in it."""
-    ned_from_enu, frd_from_flu = (0.5**0.5, 0.5**0.5, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-    turned = multiply(multiply(np.array(ned_from_enu), truth.body), np.array(frd_from_flu))
-    entries = []
-    for row, t in enumerate(truth.t_ns.tolist()):
-        east, north, up = truth.enu[row].tolist()
-        pose = {
-            "position": {"x": north, "y": east, "z": -up},
-            "orientation": dict(zip("xyzw", turned[row].tolist(), strict=True)),
-        }
-        fields = {"header": header(t, "drone_1"), "child_frame_id": "odom_local_ned", "pose": {"pose": pose}}
-        entries.append(Entry("/airsim_node/drone_1/odom_local_ned", "nav_msgs/msg/Odometry", t, fields))
-    write_log(folder, name, "ros1", entries)
-    return {"file": f"{name}.bag", "of": "body"}
-
-
-def test_odometry_of_airsims_node_is_ned(tmp_path: Path) -> None:
-    flight = with_poses(tmp_path, _airsim)
-    for k, name in enumerate(flight.cameras):
-        truth = drone_of(flight, k)
-        yaw, pitch, _ = truth.gimbal_ypr_deg[0].tolist()
-        camera = flight.settings["cameras"][name]
-        camera["gimbal"] = {"yaw_deg": yaw, "pitch_deg": pitch}
-        camera["mount"] = ON_GIMBAL
-    flight.settings["world"].pop("origin")
-    flight.save()
-    ingest(flight.manifest)
-    assert len([line for line in session_of(flight)["warnings"] if "AirSim" in line]) == 2
-    for k, name in enumerate(flight.cameras):
-        found = poses_of(flight, name)[["x", "y", "z"]].to_numpy()
-        truth = drone_of(flight, k)
-        expected = truth.enu + rotate(truth.body, LEVER_ARM)
-        np.testing.assert_allclose(found, expected[: len(found)], atol=1e-6)
-
-
 def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
     return {
         "header": header(int(truth.t_ns[row]), "/gps"),
@@ -309,26 +271,17 @@ def _any_driver(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"file": f"{name}.bag", "topic": "/fix", "attitude": "/imu"}
 
 
-def _tlog_with_pictures(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
-    path = folder / _tlog(folder, name, truth)["file"]
-    path.write_bytes(path.read_bytes() + tlog_pictures(truth))
-    return {"file": path.name}
-
-
-@pytest.mark.parametrize("write", [_ulog, _tlog_with_pictures])
-def test_frames_at_the_triggers_of_an_autopilot(tmp_path: Path, write: Any) -> None:
-    flight = with_poses(tmp_path, write, ON_GIMBAL)
+def test_frames_at_the_triggers_of_an_autopilot(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _ulog, ON_GIMBAL)
     for camera in flight.settings["cameras"].values():
         camera["frame_times"] = dict(camera["pose"])
     flight.save()
     ingest(flight.manifest)
     for name in flight.cameras:
-        frames = pd.read_parquet(
-            flight.manifest.with_suffix(".session") / "cameras" / name / "frames.parquet"
-        )
-        assert (
-            np.abs(frames["t_ns"].to_numpy() - flight.t_ns).max() <= 2000
-        )  # two clocks of whole microseconds
+        session = flight.manifest.with_suffix(".session")
+        frames = pd.read_parquet(session / "cameras" / name / "frames.parquet")
+        # Two clocks of whole microseconds.
+        assert np.abs(frames["t_ns"].to_numpy() - flight.t_ns).max() <= 2000
 
 
 def test_a_video_starts_at_the_time_of_its_container(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,8 @@ from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.geometry.joint_angles import ANGLES
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
-from tests.commands.runner import content, mocap, refused, succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import content, mocap, refused, result_of, succeeds
 from tests.commands.test_overlay import filmed_flight, session_of
 from tests.formats.skeletons.test_trc import opensim
 from tests.synthetic.flights import START_NS, write_flight
@@ -39,9 +39,9 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     names = "angles,bvh,c3d,csv,mcap,rerun,trc,tum"
-    result = json.loads(succeeds("export", filmed, "--to", names, "-o", out, "--pictures-hz", "5", "--json"))
+    result = result_of("export", filmed, "--to", names, "-o", out, "--pictures-hz", "5")
     written = {Path(path).name for path in result["written"]}
-    record = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"]
+    record = read_json(out / RECORD)["files"]
     assert set(record) | {RECORD} == written | {RECORD} == {path.name for path in out.iterdir()}
     stated = {(facts["format"], facts["unit"], facts["axes"]) for facts in record.values()}
     assert {
@@ -80,7 +80,7 @@ def test_a_session_without_a_skeleton_gives_the_cameras_and_says_so(tmp_path: Pa
     succeeds("ingest", flight.manifest)
     result = mocap("export", tmp_path / "flight.session", "--to", name)
     assert (result.returncode, "mocap reconstruct" in result.stderr) == (0, True)
-    files = json.loads((tmp_path / "flight.export" / RECORD).read_text(encoding="utf-8"))["files"]
+    files = read_json(tmp_path / "flight.export" / RECORD)["files"]
     assert all(len(facts["notes"]) == 1 for facts in files.values())
     assert refused("export", tmp_path / "flight.session", "--to", "trc").count("mocap reconstruct") == 1
 
@@ -131,7 +131,7 @@ def test_seconds_count_from_the_first_picture_or_the_epoch(filmed: Path, tmp_pat
     for choice, zero_ns in (((), START_NS), (("--time", "zero"), START_NS), (("--time", "epoch"), 0)):
         succeeds("export", filmed, "--to", "trc", *choice, "-o", out)
         (path,) = out.glob("*.trc")
-        facts = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"][path.name]
+        facts = read_json(out / RECORD)["files"][path.name]
         assert facts["zero_ns"] == zero_ns
         first[facts["time"]] = read_trc(path).t_ns + zero_ns
     np.testing.assert_array_equal(first["zero"], first["epoch"])

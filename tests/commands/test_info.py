@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 from pipelines.session.storage import read_json, write_json
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import ingested, refused, result_of, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
 
@@ -25,7 +24,7 @@ drones: {{count: 3}}
 
 
 def reading(path: Path) -> dict[str, Any]:
-    facts = json.loads(succeeds("info", path, "--json"))["readings"]
+    facts = result_of("info", path)["readings"]
     assert len(facts) == 1
     return dict(facts[0])
 
@@ -124,6 +123,5 @@ def test_detections_of_a_session_are_the_imported_or_the_found_ones(tmp_path: Pa
     succeeds("reconstruct", session, "--method", "robust", "--detector", spot_detector(tmp_path))
     assert detections() == dict.fromkeys(CAMERAS, 6)  # one person in each of the pictures
     flight = write_flight(tmp_path / "imported", seconds=0.2, clean=True)
-    succeeds("ingest", flight.manifest)
-    session = flight.manifest.with_suffix(".session")
+    session = ingested(flight)
     assert detections() == {"drone1": 6, "drone2": 6}

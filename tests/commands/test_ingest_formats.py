@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.geometry.cameras import camera_matrix
 from pipelines.session.description import read_description
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import ingested, refused, succeeds
 from tests.synthetic.flights import LENS, write_flight
 
 SIZE = [LENS.width, LENS.height]
@@ -31,8 +31,7 @@ def test_a_calibration_without_a_size_takes_that_of_the_pictures(tmp_path: Path)
     refused("ingest", flight.manifest)  # neither the calibration nor the keypoints have a size
     camera["keypoints"]["image_size"] = SIZE
     flight.save()
-    succeeds("ingest", flight.manifest)
-    session = flight.manifest.with_suffix(".session")
+    session = ingested(flight)
     lenses = [read_description(session).cameras[name].intrinsics for name in ("drone1", "drone2")]
     assert (lenses[0].width, lenses[0].height, lenses[0].fx) == (*SIZE, LENS.fx)
     assert lenses[1].width == lenses[0].width

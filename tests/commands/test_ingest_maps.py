@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from pipelines.formats.logs.maps import DAMAGED
 from pipelines.formats.maps.octomap import FORMAT
 from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
+from pipelines.session.storage import read_json
 from tests.commands.runner import content, mocap, refused, succeeds
 from tests.commands.test_real_logs import facts, session_of, write_flight
 from tests.real_data import real_data
@@ -57,7 +57,7 @@ def test_maps_of_a_log_are_stored_with_their_times(tmp_path: Path, container: Co
     assert re.search(r"\b2 maps\b.*\b3\b", done.stderr)
     session = tmp_path / "flight.session"
     start_ns = int(flight.t_ns[0])
-    index = json.loads((session / "map" / "index.json").read_text(encoding="utf-8"))["maps"]
+    index = read_json(session / "map" / "index.json")["maps"]
     assert [(one["file"], one["from_ns"]) for one in index] == [
         ("0.npz", start_ns),
         ("1.npz", start_ns + 3 * SECOND // 5),
@@ -65,7 +65,7 @@ def test_maps_of_a_log_are_stored_with_their_times(tmp_path: Path, container: Co
     for one, side in zip(load_maps(session), (3, 6), strict=True):
         assert int((one.probability >= 0.5).sum()) == 8 * side
         np.testing.assert_allclose(one.origin, [-10, -10, 0], rtol=0, atol=1e-9)
-    stored = json.loads((session / "session.json").read_text(encoding="utf-8"))
+    stored = read_json(session / "session.json")
     assert stored["map"]["occupied"] == 48  # of the last one
     assert [(one["from_ns"], one["occupied"], one["free"]) for one in stored["map"]["maps"]] == [
         (start_ns, 24, 40 * 40 - 3),

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipelines.session.stages import locked
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import ingested, refused, succeeds
 from tests.synthetic.flights import write_flight
 
 
 def test_second_writer_says_so(tmp_path: Path) -> None:
     flight = write_flight(tmp_path)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
+    session = ingested(flight)
     with locked(session):
         holder = (session / ".lock.pid").read_text().strip()
         for arguments in (

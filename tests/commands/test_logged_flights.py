@@ -14,7 +14,8 @@ import pytest
 
 from pipelines.formats.logs.recordings import TRUNCATED
 from pipelines.geometry.poses import conjugate, multiply
-from tests.commands.runner import content, mocap, refused, succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import content, measured, mocap, refused, succeeds
 from tests.synthetic.logged_flights import write_logged_flight
 from tests.synthetic.logs import CONTAINERS, Container, cut
 
@@ -22,7 +23,7 @@ from tests.synthetic.logs import CONTAINERS, Container, cut
 def ingested(folder: Path) -> tuple[Path, dict[str, Any]]:
     succeeds("ingest", folder / "flight.yaml")
     session = folder / "flight.session"
-    return session, json.loads((session / "session.json").read_text(encoding="utf-8"))
+    return session, read_json(session / "session.json")
 
 
 def tables(session: Path) -> dict[str, str]:
@@ -62,7 +63,7 @@ def test_poses_of_the_body_become_those_of_the_camera(tmp_path: Path, container:
         assert np.sqrt(poses["c22"].to_numpy()) == pytest.approx(0.3, abs=0.001)
         intrinsics = description["cameras"][name]["intrinsics"]
         assert (intrinsics["width"], intrinsics["fx"]) == (1280, 762.0)
-    result = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
+    result = measured(session)
     assert result["mpjpe_mm"] < 0.5
 
 
@@ -74,7 +75,7 @@ def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
     line = refused("ingest", flight.manifest, "--strict")
     assert re.search(r"flight\.yaml: .*--strict .*\(cameras.drone1.", line)
     assert f"1 {TRUNCATED}" in line
-    kept = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    kept = read_json(tmp_path / "flight.session" / "session.json")
     assert kept["cameras"]["drone1"]["poses"]["dropped"] == {}  # the session is the one from before
     _, description = ingested(tmp_path)
     assert description["cameras"]["drone1"]["poses"]["dropped"]
@@ -90,7 +91,7 @@ def test_truncated_log_is_salvaged_and_the_loss_is_said(tmp_path: Path, containe
     assert done.returncode == 0, done.stderr
     lost = [line for line in done.stderr.splitlines() if "drone2" in line and "dropped" in line]
     assert lost, done.stderr
-    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    stored = read_json(tmp_path / "flight.session" / "session.json")
     poses = stored["cameras"]["drone2"]["poses"]
     assert 0 < poses["count"] < len(flight.t_ns)
     assert poses["dropped"]
@@ -102,7 +103,7 @@ def test_clock_that_jumps_in_flight_is_said_and_the_rest_is_used(tmp_path: Path)
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0, done.stderr
     assert re.search(r"\bclock\b.* -30 s .*; header ", done.stderr)
-    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    stored = read_json(tmp_path / "flight.session" / "session.json")
     # What was stamped before the jump's landing cannot be put into an order: it is counted.
     lost = stored["cameras"]["drone1"]["poses"]["dropped"]
     assert sum(lost.values()) + stored["cameras"]["drone1"]["poses"]["count"] == len(flight.t_ns)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import tarfile
 from pathlib import Path
 
 import pytest
 
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import refused, result_of, succeeds
 
 FILES = ("pose_detection.tflite", "pose_landmark_full.tflite")
 HEAVY = "pose_landmark_heavy.tflite"
@@ -29,7 +28,7 @@ def test_what_is_missing_is_listed_with_the_command_that_gets_it(empty_cache: Pa
         assert file in listed
     for name in ("blazepose", "blazepose-heavy"):
         assert f"`mocap models fetch {name}`" in listed
-    detectors = json.loads(succeeds("models", "--json"))["detectors"]
+    detectors = result_of("models")["detectors"]
     assert {d["name"]: d["files"] for d in detectors} == {
         "blazepose": dict.fromkeys(FILES),
         "blazepose-heavy": dict.fromkeys((FILES[0], HEAVY)),

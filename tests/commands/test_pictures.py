@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tests.commands.runner import mocap, refused, succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import ingested, measured, mocap, refused, succeeds
 from tests.synthetic.flights import START_NS, SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 from tests.synthetic.videos import SIZE, TICK_S, even_ticks, uneven_ticks, write_video
@@ -44,10 +45,7 @@ def with_videos(folder: Path) -> SyntheticFlight:
 
 
 def session_json(folder: Path) -> dict[str, Any]:
-    stored: dict[str, Any] = json.loads(
-        (folder / "flight.session" / "session.json").read_text(encoding="utf-8")
-    )
-    return stored
+    return read_json(folder / "flight.session" / "session.json")
 
 
 def test_frames_are_stamped_by_the_container(tmp_path: Path) -> None:
@@ -77,9 +75,8 @@ def test_frame_times_of_a_csv(tmp_path: Path) -> None:
 
 def test_overlays_lie_on_frames_until_the_video_is_gone(tmp_path: Path) -> None:
     flight = with_videos(tmp_path)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
-    assert json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))["mpjpe_mm"] < 2
+    session = ingested(flight)
+    assert measured(session)["mpjpe_mm"] < 2
     succeeds("report", session)
     page = session / "report" / "index.html"
     pictures = page.read_text(encoding="utf-8").count("UklGR")
@@ -88,7 +85,7 @@ def test_overlays_lie_on_frames_until_the_video_is_gone(tmp_path: Path) -> None:
     succeeds("report", session)
     fewer = page.read_text(encoding="utf-8").count("UklGR")
     assert 0 < fewer < pictures
-    stage = json.loads((session / "report" / "stage.json").read_text(encoding="utf-8"))
+    stage = read_json(session / "report" / "stage.json")
     assert any("drone1" in warning for warning in stage["warnings"])
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.commands.runner import mocap, refused, succeeds
+from tests.commands.runner import ingested, mocap, refused, result_of, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
 METHODS = ("dlt", "midpoint", "robust")
@@ -52,8 +52,7 @@ def test_flight_without_noise_is_reconstructed_below_half_a_millimetre(
         pose_format=poses,
         seconds=0.5,
     )
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest)
+    session = ingested(flight)
     for method in METHODS:
         result = metrics(session, "--method", method)
         assert result["method"] == method
@@ -68,8 +67,7 @@ def test_bystander_whom_one_camera_misses_is_not_the_actor(tmp_path: Path) -> No
     keypoints = tmp_path / "drone4.json"
     people = json.loads(keypoints.read_text(encoding="utf-8"))
     keypoints.write_text(json.dumps([p for p in people if p["idx"] == 1]), encoding="utf-8")
-    succeeds("ingest", flight.manifest)
-    session = tmp_path / "flight.session"
+    session = ingested(flight)
     assert metrics(session)["mpjpe_mm"] < 0.5
     both = metrics(session, "--persons", "2")
     assert both["mpjpe_mm"] < 0.5
@@ -89,9 +87,9 @@ def test_tables_are_read_by_pandas_alone(flight: SyntheticFlight, session: Path)
 
 
 def test_exports_lie_beside_the_session_and_are_not_overwritten(session: Path) -> None:
-    result = json.loads(succeeds("export", session, "--to", "trc,csv,tum", "--json"))
+    result = result_of("export", session, "--to", "trc,csv,tum")
     assert {Path(path).suffix for path in result["written"]} == {".trc", ".csv", ".tum"}
-    assert json.loads(succeeds("export", session, "--to", "trc", "--json"))["written"] == []
+    assert result_of("export", session, "--to", "trc")["written"] == []
     trc = next(Path(path) for path in result["written"] if path.endswith(".trc"))
     trc.write_text("changed by hand", encoding="utf-8")
     refused("export", session, "--to", "trc", code="exists")
@@ -107,7 +105,7 @@ def test_info_knows_what_it_wrote_and_what_it_reads(flight: SyntheticFlight, ses
         (folder / "drone1.json", "AlphaPose"),
         (folder / "drone1.tum", "TUM"),
     ):
-        [reading] = json.loads(succeeds("info", path, "--json"))["readings"]
+        [reading] = result_of("info", path)["readings"]
         assert kind in reading["kind"]
 
 

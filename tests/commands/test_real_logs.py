@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
+from pipelines.session.storage import read_json
 from tests.commands.runner import mocap, refused, succeeds
 from tests.real_data import real_data
 
@@ -24,7 +26,9 @@ def facts(name: str) -> dict[str, Any]:
     return expected
 
 
-def write_flight(folder: Path, pose: dict[str, Any], start_s: float, **parts: Any) -> Path:
+def write_flight(
+    folder: Path, pose: dict[str, Any], start_s: float, *, mounted: bool = False, **parts: Any
+) -> Path:
     """Write a flight of one camera with poses from a real log, and keypoints that are always present."""
     people = [
         {
@@ -38,24 +42,29 @@ def write_flight(folder: Path, pose: dict[str, Any], start_s: float, **parts: An
     (folder / "keypoints.json").write_text(json.dumps(people), encoding="utf-8")
     camera = {
         "pose": pose,
-        "mount": {"looks": "forward"},
         "intrinsics": {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240},
         "frame_times": {"start": start_s, "fps": 10},
         "keypoints": "keypoints.json",
     }
-    if pose.get("of") != "body":
-        del camera["mount"]
+    if mounted or pose.get("of") == "body":
+        camera["mount"] = {"looks": "forward"}
     path = folder / "flight.yaml"
     with path.open("w", encoding="utf-8") as file:
         YAML(typ="safe", pure=True).dump({"schema": 1, "cameras": {"husky": camera}, **parts}, file)
     return path
 
 
+def copied(folder: Path, name: str) -> str:
+    """Copy a log beside the manifest; return its name."""
+    return Path(shutil.copy(real_data(name), folder)).name
+
+
+def poses_of(path: Path) -> pd.DataFrame:
+    return pd.read_parquet(path.with_suffix(".session") / "cameras" / "husky" / "poses.parquet")
+
+
 def session_of(path: Path) -> dict[str, Any]:
-    stored: dict[str, Any] = json.loads(
-        (path.with_suffix(".session") / "session.json").read_text(encoding="utf-8")
-    )
-    return stored
+    return read_json(path.with_suffix(".session") / "session.json")
 
 
 def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
@@ -66,7 +75,7 @@ def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
     assert " /husky_velocity_controller/odom, " in done.stderr
-    poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
+    poses = poses_of(path)
     assert len(poses) == expected["count"]
     assert session_of(path)["cameras"]["husky"]["poses"]["dropped"] == {}
     # Stated with six decimals, stamps as doubles of seconds since the epoch.
@@ -77,17 +86,6 @@ def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
     assert np.linalg.norm(np.diff(position, axis=0), axis=1).sum() == pytest.approx(
         expected["path_length"], abs=1e-3
     )
-
-
-def test_a_chain_of_transforms(tmp_path: Path) -> None:
-    name = "logs/ros1/foxglove_example.bag"
-    expected = facts(name)
-    pose = {"file": str(real_data(name)), "parent": "world", "child": "turtle1", "of": "body"}
-    path = write_flight(tmp_path, pose, start_s=expected["start_ns"] / 1e9 + 5)
-    succeeds("ingest", path)
-    poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
-    # Two turtles, one transform each, in every other message of /tf.
-    assert len(poses) == expected["topics"]["/tf"]["count"] / 2
 
 
 def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
@@ -124,23 +122,33 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
     assert "CylinderCameraModel" in refused("ingest", path)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "logs/ros1/husky_gps_imu_odom.bag",
-        "logs/ros1/foxglove_example-bz2.bag",
-        "logs/ros2/rosbag2_wbag_sqlite3",
-        "logs/ros2/rosbag2_wbag_mcap",
-        "logs/mcap/edge_publish_vs_log_time.mcap",
-    ],
-)
-def test_info_of_real_logs(name: str) -> None:
-    expected = facts(name)
-    (reading,) = json.loads(succeeds("info", real_data(name), "--json"))["readings"]
-    assert reading["messages"] == expected["messages"]
-    # The public reader trusts metadata.yaml; if that is wrong, the reading has both values.
-    stated = reading.get("metadata.yaml states", reading)
-    assert stated["first_ns"] == expected["start_ns"]
-    assert {topic: seen["messages"] for topic, seen in reading["topics"].items()} == {
-        topic: seen["count"] for topic, seen in expected["topics"].items()
-    }
+def test_a_phantom_with_gimbal_angles_as_a_command(tmp_path: Path) -> None:
+    name = "logs/dji_srt/p4_rtk.SRT"
+    told = facts(name)
+    path = write_flight(tmp_path, {"file": copied(tmp_path, name)}, 10.0)
+    done = mocap("ingest", path, "--max-pose-gap", "1.5")
+    assert done.returncode == 0, done.stderr
+    latitude, longitude = told["lat_lon_first"]
+    assert f"world origin: {latitude:.7f}, {longitude:.7f}, 0.00 m (p4_rtk.SRT)" in done.stdout
+    assert "shows no clock" in done.stderr
+    poses = poses_of(path)
+    assert len(poses) == told["positions"]
+    assert poses["z"].min() == pytest.approx(told["H_m"]["min"], abs=0.04)  # the Earth falls away on 700 m
+    # D is the drone's own distance from its take-off, from its unrounded positions.
+    flown = np.hypot(*(poses[axis].iloc[-1] - poses[axis].iloc[0] for axis in ("x", "y")))
+    assert flown == pytest.approx(660, abs=5)
+
+
+def test_px4_at_gps_time_as_a_command(tmp_path: Path) -> None:
+    name = "logs/ulog/sample_log_small.ulg"
+    told = facts(name)
+    first_s = told["gps_time_utc_usec_first_last"][0] / 1e6
+    pose = {"file": copied(tmp_path, name), "position": "gps"}
+    path = write_flight(tmp_path, pose, first_s + 1, mounted=True)
+    done = mocap("ingest", path)
+    assert done.returncode == 0, done.stderr
+    assert "its stamps are turned to UTC" in done.stderr
+    clock = session_of(path)["cameras"]["husky"]["log_clock"]
+    assert clock["events"] == told["gps_samples"]
+    # The first attitude after the first fix: those come every 5 ms, with pauses.
+    assert 0 <= poses_of(path)["t_ns"].iloc[0] / 1e9 - first_s < 0.05

@@ -15,7 +15,8 @@ from scipy.stats import t
 
 from mocap_cli.main import Mocap
 from mocap_cli.reconstruct import reconstruct_command
-from tests.commands.runner import succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import ingested, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
 
@@ -49,8 +50,7 @@ def run(session: Path, *options: str) -> dict[str, Any]:
 
 
 def stage(session: Path) -> dict[str, Any]:
-    told: dict[str, Any] = json.loads((session / "reconstruct" / "stage.json").read_text(encoding="utf-8"))
-    return told
+    return read_json(session / "reconstruct" / "stage.json")
 
 
 def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, Path]) -> None:
@@ -87,8 +87,7 @@ def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, P
 
 def test_people_beyond_those_asked_for_are_counted_and_said(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=3, bystander=True, clean=True)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
+    session = ingested(flight)
     times = len(flight.t_ns)
     passing = {
         name: len(json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8"))) - times
@@ -145,8 +144,7 @@ def test_gaps_stay_open_until_somebody_asks(clean: tuple[SyntheticFlight, Path])
 
 def test_smoothing_is_said_and_lowers_what_noise_does(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=3, seconds=1.0, pose_noise={"white": {"position_m": 0.1}})
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
+    session = ingested(flight)
     rough = run(session)
     assert rough["smoothing"] is None
     smooth = run(session, "--smooth", "butterworth:cutoff_hz=4,order=4")

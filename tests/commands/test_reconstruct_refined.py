@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 
 from pipelines.session.people import mirrored
-from tests.commands.runner import mocap, succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import ingested, measured, mocap, result_of, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
 NOISE = {"white": {"position_m": 0.2, "rotation_deg": 0.7}}
@@ -21,10 +22,9 @@ GOOD = {"white": {"position_m": 0.02, "rotation_deg": 0.1}}
 
 def test_refined_halves_the_error_of_noisy_poses_and_writes_them(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=3, seconds=1.5, pose_noise=NOISE)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    trusting = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
-    metrics = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
+    session = ingested(flight)
+    trusting = measured(session)
+    metrics = result_of("reconstruct", session, "--method", "refined")
     assert metrics["refinement"]["fallback"] is None
     # White errors are independent from picture to picture; a smooth walk averages a dozen and more.
     assert metrics["mpjpe_mm"] < 0.5 * trusting["mpjpe_mm"]
@@ -48,11 +48,10 @@ def test_refined_takes_the_sides_on_which_the_views_agreed(tmp_path: Path) -> No
     flight = write_flight(tmp_path, cameras=4, seconds=1.5, pose_noise=GOOD)
     # A camera that calls left right all the time: only the other cameras tell.
     exchange_sides(tmp_path / "drone1.json", flight.joints)
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    robust = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
-    refined = json.loads(succeeds("reconstruct", session, "--method", "refined", "--json"))
-    counts = json.loads((session / "reconstruct" / "stage.json").read_text(encoding="utf-8"))["counts"]
+    session = ingested(flight)
+    robust = measured(session)
+    refined = result_of("reconstruct", session, "--method", "refined")
+    counts = read_json(session / "reconstruct" / "stage.json")["counts"]
     assert counts["left_right_swaps"]["between_views"]["undone"] > 0
     # With a quarter of the views on the wrong sides it is no better than what it started from.
     assert refined["refinement"]["fallback"] is None
@@ -84,9 +83,8 @@ def test_refined_falls_back_to_what_robust_gives_and_says_why(
 ) -> None:
     flight = written(tmp_path)
     flight.save()
-    session = tmp_path / "flight.session"
-    succeeds("ingest", flight.manifest, "-o", session)
-    robust = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
+    session = ingested(flight)
+    robust = measured(session)
     skeleton = (session / "reconstruct" / "skeleton.parquet").read_bytes()
 
     done = mocap("reconstruct", session, "--method", "refined", "--json")

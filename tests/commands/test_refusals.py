@@ -104,7 +104,7 @@ def test_nan_poses_are_counted_and_the_rest_is_used(flight: SyntheticFlight, tmp
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
     assert re.search("^warning: drone1: poses .*: 3 ", done.stderr, re.MULTILINE)
-    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    stored = read_json(tmp_path / "flight.session" / "session.json")
     assert list(stored["cameras"]["drone1"]["poses"]["dropped"].values()) == [3]
 
 

@@ -26,6 +26,7 @@ from pipelines.session.description import read_description
 from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
 from pipelines.session.stages import locked
+from pipelines.session.storage import read_json
 from pipelines.simulate import simulate
 from tests.commands.runner import as_if_written, content
 from tests.real_data import real_data
@@ -175,7 +176,7 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(
 def test_what_is_stored(mound: Path, at_the_mound: dict[str, Any]) -> None:
     metrics = at_the_mound
     folder = mound / "replan"
-    assert json.loads((folder / "metrics.json").read_text()) == metrics
+    assert read_json(folder / "metrics.json") == metrics
     assert metrics["simulated"] is True
     assert metrics["actor"] == {"planned_with": "log", "scored_against": "truth"}
     for name, arm in metrics["arms"].items():
@@ -218,11 +219,11 @@ def test_every_comparison_stays_by_its_name(calm: Path) -> None:
     folder = calm / "replan"
 
     def stored(place: Path) -> Any:
-        return json.loads((place / "metrics.json").read_text())
+        return read_json(place / "metrics.json")
 
     assert stored(folder) == stored(folder / second["name"]) == second
     assert stored(folder / "near") == first
-    made_of = json.loads((folder / "near" / "settings.json").read_text())
+    made_of = read_json(folder / "near" / "settings.json")
     assert made_of["settings"]["planner.radius_m"] == 8.0
     track = pd.read_parquet(folder / "near" / "fixed" / "trajectories.parquet")
     assert track["slot_range_m"].max() == pytest.approx(8.0)
@@ -299,7 +300,7 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert arm["tilt_deg"]["mean"] == pytest.approx(30, abs=3)
     assert metrics["differences"] == []
     assert metrics["verdict"].startswith("fixed")
-    stated = json.loads((calm / "replan" / "stage.json").read_text())["settings"]
+    stated = read_json(calm / "replan" / "stage.json")["settings"]
     assert (stated["planner.horizon_s"], stated["planner.ranges_m"]) == (7.0, [6.0, 9.0])
     table = pd.read_parquet(calm / "replan" / "fixed" / "trajectories.parquet")
     assert list(table["camera"][:4]) == ["drone1", "drone2", "drone3", "drone4"]
@@ -316,7 +317,7 @@ def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -
     reconstruct(session, ReconstructSettings(method="robust"))
     done = compare(session, "--trials", "2", "--arms", "fixed")
     assert done.exit_code == 0, done.stderr
-    metrics = json.loads((session / "replan" / "metrics.json").read_text())
+    metrics = read_json(session / "replan" / "metrics.json")
     assert metrics["actor"] == {"planned_with": "reconstruction", "scored_against": "truth"}
     assert metrics["maps"] == 0
     assert metrics["arms"]["fixed"]["min_clearance_m"] is None
@@ -389,7 +390,7 @@ def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
     manifest.write_text(text.replace("site.npz", str(site)), encoding="utf-8")
     session = tmp_path / "building.session"
     ingest(manifest, session=session)
-    stated = json.loads((session / "session.json").read_text())["map"]
+    stated = read_json(session / "session.json")["map"]
     assert stated["occupied"] == 185673
     metrics = compared(session, "--trials", "1", "--config", "radius_m=2.5", "--arms", "fixed")
     assert metrics["arms"]["fixed"]["min_clearance_m"] is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from pipelines.geometry.arrays import Float
-from tests.commands.runner import refused, succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import refused, result_of, succeeds
 from tests.commands.test_replan import CALM, session_of
 from tests.synthetic.logs import Entry, write_log
 
@@ -70,7 +70,7 @@ def test_what_was_commanded_is_an_arm_like_the_others(flown: Path, tmp_path: Pat
     )
     session = tmp_path / "planned.session"
     succeeds("ingest", manifest, "-o", session)
-    stored = json.loads((session / "session.json").read_text(encoding="utf-8"))
+    stored = read_json(session / "session.json")
     assert {name: entry["source"] for name, entry in stored["plan"].items()} == {
         "drone1": "planner.mcap",
         "drone2": "drone2.tum",
@@ -79,7 +79,7 @@ def test_what_was_commanded_is_an_arm_like_the_others(flown: Path, tmp_path: Pat
     table = pd.read_parquet(session / "plan.parquet")
     assert list(table.columns) == ["t_ns", "camera", "x", "y", "z"]
 
-    metrics = json.loads(succeeds("replan-compare", session, "--trials", "2", "--json"))
+    metrics = result_of("replan-compare", session, "--trials", "2")
     assert list(metrics["arms"]) == ["adaptive", "fixed", "joint", "flown", "planned"]
     planned = metrics["arms"]["planned"]
     assert planned["simulated"] is False
@@ -106,7 +106,7 @@ def test_one_drone_alone_and_a_gap_in_its_commands(flown: Path, tmp_path: Path) 
     (flown / "gap.tum").write_text("\n".join([*rows[:4], *rows[-4:]]) + "\n", encoding="utf-8")
     session = tmp_path / "alone.session"
     succeeds("ingest", with_plan(flown, "alone", drone2="gap.tum"), "-o", session)
-    metrics = json.loads(succeeds("replan-compare", session, "--arms", "planned", "--trials", "1", "--json"))
+    metrics = result_of("replan-compare", session, "--arms", "planned", "--trials", "1")
     assert metrics["arms"]["planned"]["drones"] == 1
     assert any(re.search(r"^planned: \d+\.\d %", warning) for warning in metrics["warnings"])
     track = pd.read_parquet(session / "replan" / "planned" / "trajectories.parquet")

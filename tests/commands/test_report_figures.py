@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 
 from pipelines.ingest import ingest
 from pipelines.reporting import chart
+from pipelines.session.storage import read_json
 from tests.commands.runner import refused, succeeds
 from tests.synthetic.flights import write_flight
 
@@ -22,7 +22,7 @@ def test_figures_of_a_session_and_of_a_comparison(tmp_path: Path, monkeypatch: p
     ingest(write_flight(tmp_path, seconds=0.5).manifest, session=session)
     succeeds("reconstruct", session, "--method", "robust")
     assert f"written: {figures}" in succeeds("report", session, "--figures", figures)
-    told = json.loads((figures / "figures.json").read_text(encoding="utf-8"))
+    told = read_json(figures / "figures.json")
     assert list(told["sessions"]) == ["robust"]
     assert {"top", "time", "joints"} <= {each["figure"] for each in told["figures"]}
     assert f"unchanged: {figures}" in succeeds("report", session, "--figures", figures)
@@ -34,7 +34,7 @@ def test_figures_of_a_session_and_of_a_comparison(tmp_path: Path, monkeypatch: p
     shutil.copytree(session, other)
     succeeds("reconstruct", other, "--method", "dlt")
     succeeds("report", session, other, "-o", tmp_path / "page.html", "--figures", both)
-    told = json.loads((both / "figures.json").read_text(encoding="utf-8"))
+    told = read_json(both / "figures.json")
     keys = [each["figure"] for each in told["figures"]]
     assert keys == ["compare-time", "compare-joints"]
     assert list(told["sessions"]) == ["robust", "dlt"]

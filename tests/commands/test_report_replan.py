@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from html import unescape
 from pathlib import Path
 
 import pytest
 
+from pipelines.session.storage import read_json
 from pipelines.study import study
 from tests.commands.runner import succeeds
 
@@ -34,7 +34,7 @@ def test_the_report_shows_the_comparison_of_the_session(tmp_path: Path) -> None:
     succeeds("replan-compare", session, "--trials", "2", "--arms", "fixed,flown")
     succeeds("report", session)
     shown = page.read_text(encoding="utf-8")
-    metrics = json.loads((session / "replan" / "metrics.json").read_text(encoding="utf-8"))
+    metrics = read_json(session / "replan" / "metrics.json")
     assert metrics["verdict"][1:] in unescape(shown)
     assert all(f'id="figure-arms-{key}"' in shown for key in ("top", "time"))
     # Figures that are computed from the tables agree with the metrics.

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
-from tests.commands.runner import content, mocap, refused, succeeds
+from tests.commands.runner import content, mocap, refused, result_of, succeeds
 from tests.commands.test_init import write_lenses
 from tests.synthetic.flights import write_flight
 
@@ -24,7 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_folder_goes_to_a_verdict_and_the_same_command_changes_nothing(folder: Path) -> None:
-    result = json.loads(succeeds("run", folder, "--json"))
+    result = result_of("run", folder)
     assert result["flight"] == str(folder / "flight.yaml")
     assert result["assumed"]
     assert result["verdict"]["grade"] in {"good", "usable", "poor"}

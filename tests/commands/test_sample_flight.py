@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,14 +33,14 @@ def test_the_detector_and_true_poses_give_the_skeleton(
     Frames were lost, so two of the 30 pictures have no partner in the other camera.
     """
     session, said = reconstructed(tmp_path, detector, "--pictures", "::12")
-    metrics: dict[str, Any] = read_json(session / "reconstruct" / "metrics.json")
+    metrics = read_json(session / "reconstruct" / "metrics.json")
     assert metrics["mpjpe_mm"] < most_mm
     assert metrics["reconstructed_share"] > 0.95 * 28 / 30
     # Without heavy, one line advises to use it.
     assert sum("--detector blazepose-heavy" in line for line in said.splitlines()) == advised
 
     # Its confidences are weighed by its own calibration, and the report names it.
-    record = json.loads((session / "reconstruct" / "stage.json").read_text(encoding="utf-8"))
+    record = read_json(session / "reconstruct" / "stage.json")
     measured = measured_for(detector)
     assert measured is not None
     assert record["inputs"]["calibration of confidences"] == sha256_of(measured)

@@ -18,8 +18,9 @@ from pipelines.formats.common.files import read_yaml
 from pipelines.formats.videos import video
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.session.errors import DataError
+from pipelines.session.storage import read_json
 from pipelines.simulate import simulate
-from tests.commands.runner import content, mocap, refused, succeeds
+from tests.commands.runner import content, measured, mocap, refused, result_of, succeeds
 from tests.real_data import real_data
 
 EXACT = """
@@ -94,10 +95,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def reconstructed(flight: Path, *options: str) -> dict[str, Any]:
     succeeds("ingest", flight)
-    metrics: dict[str, Any] = json.loads(
-        succeeds("reconstruct", flight.with_suffix(".session"), "--method", "robust", "--json", *options)
-    )
-    return metrics
+    return measured(flight.with_suffix(".session"), *options)
 
 
 def test_the_truth_closes(tmp_path: Path) -> None:
@@ -140,9 +138,9 @@ def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_pat
     ]
     assert logs[0] == logs[1]
 
-    summary = json.loads((flights[0].parent / "simulation.json").read_text())
+    summary = read_json(flights[0].parent / "simulation.json")
     assert summary["frames"]["drone1"] < 15  # some were dropped
-    stated: dict[str, Any] = json.loads(succeeds("ingest", flights[0], "--json"))
+    stated = result_of("ingest", flights[0])
     camera = stated["cameras"]["drone2"]
     assert camera["frames"]["count"] == summary["frames"]["drone2"]
     assert (camera["intrinsics"]["width"], camera["intrinsics"]["height"]) == (128, 72)
@@ -181,7 +179,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_person_is_in_the_truth_the_keypoints_and_the_log(two: Path) -> None:
     folder = two.parent
-    assert json.loads((folder / "truth" / "people.json").read_text()) == {"people": ["anna", "ben"]}
+    assert read_json(folder / "truth" / "people.json") == {"people": ["anna", "ben"]}
     truth = pd.read_csv(folder / "truth" / "joints.csv")
     assert truth.groupby("t_ns").size().eq(2 * 17).all()
     hip = truth[truth["joint"] == "left_hip"]
@@ -203,9 +201,7 @@ def test_every_person_is_in_the_truth_the_keypoints_and_the_log(two: Path) -> No
     assert read_yaml(two)["actors"] == {
         name: {"file": "drone1", "topic": f"/actor/{name}", "point": "hip"} for name in ("anna", "ben")
     }
-    assert list(
-        json.loads(succeeds("info", folder / "scenario.yaml", "--json"))["readings"][0]["actors"]
-    ) == [
+    assert list(result_of("info", folder / "scenario.yaml")["readings"][0]["actors"]) == [
         "anna",
         "ben",
     ]
@@ -219,7 +215,7 @@ def test_everybody_reconstructed_is_compared_with_their_own_truth(tmp_path: Path
     succeeds("ingest", flight, "-o", session)
     truth = pd.read_parquet(session / "truth.parquet")
     actor = truth[(truth["person"] == 0) & (truth["joint"] == "left_hip")]
-    metrics = json.loads(succeeds("reconstruct", session, "--method", "robust", "--persons", "2", "--json"))
+    metrics = measured(session, "--persons", "2")
     assert metrics["joint_frames"] == 2 * 30 * 17
     assert metrics["mpjpe_mm"] < 0.5
     assert metrics["reconstructed_share"] > 0.97
@@ -272,7 +268,7 @@ def test_an_interrupted_rendering_goes_on_where_it_was(
     with av.open(str(output / "drone1.mp4")) as container:
         brightness = [frame.to_ndarray(format="gray").mean() for frame in container.decode(video=0)]
     assert max(brightness[: len(stamps)]) < 20 < min(brightness[len(stamps) :])
-    assert len(brightness) == json.loads((output / "simulation.json").read_text())["frames"]["drone1"]
+    assert len(brightness) == read_json(output / "simulation.json")["frames"]["drone1"]
 
 
 @pytest.mark.slow
@@ -352,7 +348,7 @@ def test_what_the_camera_does_is_stated_where_it_is_read(tmp_path: Path) -> None
     distortion = [-0.132, 0.111, 0.0, 0.0, -0.016]
     shot = f"rate_hz: 30, exposure_ms: 2, distortion: {distortion}, readout_ms: 20, bitrate_mbps: 0.5"
     flight = simulated(tmp_path, SMALL.replace("rate_hz: 30", shot), "--no-video")
-    said: dict[str, Any] = json.loads(succeeds("ingest", flight, "--json"))
+    said = result_of("ingest", flight)
     for camera in said["cameras"].values():
         assert camera["intrinsics"]["model"] == "radtan"
         assert camera["intrinsics"]["distortion"] == distortion

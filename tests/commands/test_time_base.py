@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from pipelines.session.description import read_description
-from tests.commands.runner import mocap, succeeds
+from pipelines.session.storage import read_json
+from tests.commands.runner import ingested, mocap, result_of, succeeds
 from tests.synthetic.flights import START_NS, SyntheticFlight, film_at, write_flight
 
 # Between two pictures a joint is taken to move in a straight line in the picture. A foot in mid swing is
@@ -20,12 +21,8 @@ INTERPOLATED_MM = 1.5
 
 
 def measured(flight: SyntheticFlight, *options: str) -> dict[str, Any]:
-    succeeds("ingest", flight.manifest)
-    session = flight.manifest.with_suffix(".session")
-    result: dict[str, Any] = json.loads(
-        succeeds("reconstruct", session, "--method", "robust", "--json", *options)
-    )
-    return result
+    session = ingested(flight)
+    return result_of("reconstruct", session, "--method", "robust", *options)
 
 
 def test_shutters_that_are_not_synchronised(tmp_path: Path) -> None:
@@ -92,18 +89,18 @@ def test_guesses_stay_visible_until_they_are_confirmed(tmp_path: Path) -> None:
     cameras["drone3"] |= {"frame_times": {"fps": 30}, "clock": {"offset_s": START_NS // 10**9, "sigma_s": 0}}
     flight.save()
     told = mocap("ingest", flight.manifest).stderr
-    session = json.loads((tmp_path / "flight.session" / "session.json").read_text())
+    session = read_json(tmp_path / "flight.session" / "session.json")
     assert session["assumptions"] == ["cameras.drone1.frame_times"]
     assert "cameras.drone1.frame_times" in told
     starts = {name: camera["clock"]["start"] for name, camera in session["cameras"].items()}
     assert starts == {"drone1": "assumed", "drone2": "stated", "drone3": "stated"}
     succeeds("reconstruct", tmp_path / "flight.session", "--method", "robust")
-    record = json.loads((tmp_path / "flight.session" / "reconstruct" / "stage.json").read_text())
+    record = read_json(tmp_path / "flight.session" / "reconstruct" / "stage.json")
     assert any("cameras.drone1.frame_times" in line for line in record["warnings"])
     del cameras["drone1"]["frame_times"]["assumed"]
     flight.save()
     succeeds("ingest", flight.manifest)
-    session = json.loads((tmp_path / "flight.session" / "session.json").read_text())
+    session = read_json(tmp_path / "flight.session" / "session.json")
     assert not session["assumptions"]
 
 

@@ -363,8 +363,12 @@ class OpenLog:
         self.parts = parts
         self.notes: list[str] = []  # on steps of the recorder's clock
         self.lost = lost
-        keys = {channel.key for part in parts for channel in part.channels.values()}
-        self._topics = {key: self._summary(*key) for key in sorted(keys)}
+        # Numbers of the channels of a topic in each part, found once: a log may hold 60,000 topics.
+        self._channels: dict[tuple[str, ...], dict[int, list[int]]] = {}
+        for place, part in enumerate(parts):
+            for number, channel in part.channels.items():
+                self._channels.setdefault(channel.key, {}).setdefault(place, []).append(number)
+        self._topics = {key: self._summary(*key) for key in sorted(self._channels)}
 
     def __enter__(self) -> OpenLog:
         """Return the log itself."""
@@ -447,8 +451,8 @@ class OpenLog:
         """Return the schemas of a topic, each once, and its stamps of receipt, sorted."""
         schemas: dict[Schema, None] = {}
         stamps = [np.zeros(0, np.int64)]
-        for part in self.parts:
-            own = [number for number, channel in part.channels.items() if channel.key == key]
+        for place, own in self._channels[key].items():
+            part = self.parts[place]
             schemas |= dict.fromkeys(part.channels[number].schema for number in own)
             stamps.append(part.received_ns[part.rows_of(own)])
         return list(schemas), np.sort(np.concatenate(stamps))
