@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from pipelines.session.manifest import read_flight
 from pipelines.session.storage import read_json
 from tests.commands.runner import ingested, measured, mocap, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, bystander_at, write_flight
-from tests.synthetic.logged_flights import header
+from tests.synthetic.logged_flights import attitude_entry, fix_entry, pose_entry
 from tests.synthetic.logs import Entry, write_log
 from tests.synthetic.walk import COCO17
 
@@ -49,18 +48,7 @@ def hips(joints: tuple[str, ...], position: Float) -> Float:
 
 
 def _logged(topic: str, t_ns: Int64, position: Float) -> list[Entry]:
-    return [
-        Entry(
-            topic,
-            "geometry_msgs/msg/PoseStamped",
-            int(stamp_ns),
-            {
-                "header": header(int(stamp_ns), "map"),
-                "pose": {"position": dict(zip("xyz", at.tolist(), strict=True)), "orientation": {"w": 1.0}},
-            },
-        )
-        for stamp_ns, at in zip(t_ns, position, strict=True)
-    ]
+    return [pose_entry(topic, stamp, at) for stamp, at in zip(t_ns.tolist(), position.tolist(), strict=True)]
 
 
 def test_the_logged_actor_decides_who_it_is(tmp_path: Path) -> None:
@@ -118,19 +106,9 @@ def test_gimbal_angles_of_a_topic_do_not_lean_with_the_body(tmp_path: Path, rela
         position = flight.camera_position[k] - rotate(body, lever_arm)
         entries: list[Entry] = []
         for stamp_ns, at, turned in zip(flight.t_ns, position, logged_gimbal, strict=True):
-            stamped = header(int(stamp_ns), "map")
-            pose = _pose(at, body)
-            attitude = dict(zip("xyzw", turned.tolist(), strict=True))
             entries += [
-                Entry(
-                    "/pose", "geometry_msgs/msg/PoseStamped", int(stamp_ns), {"header": stamped, "pose": pose}
-                ),
-                Entry(
-                    "/gimbal",
-                    "geometry_msgs/msg/QuaternionStamped",
-                    int(stamp_ns),
-                    {"header": stamped, "quaternion": attitude},
-                ),
+                pose_entry("/pose", stamp_ns, at.tolist(), body.tolist()),
+                attitude_entry("/gimbal", stamp_ns, turned),
             ]
         write_log(tmp_path, f"{name}_log", "mcap-cdr", entries)
         camera = flight.settings["cameras"][name]
@@ -144,13 +122,6 @@ def test_gimbal_angles_of_a_topic_do_not_lean_with_the_body(tmp_path: Path, rela
         logged = poses[["qx", "qy", "qz", "qw"]].to_numpy()
         assert np.abs(poses[["x", "y", "z"]].to_numpy() - flight.camera_position[k]).max() < 1e-9
         assert np.abs(multiply(conjugate(flight.camera_quaternion[k]), logged)[:, :3]).max() < 1e-9
-
-
-def _pose(at: Any, quaternion: Any) -> dict[str, Any]:
-    return {
-        "position": dict(zip("xyz", at.tolist(), strict=True)),
-        "orientation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
-    }
 
 
 def test_a_floor_plan_is_read_again_when_its_picture_changes(tmp_path: Path) -> None:
@@ -183,31 +154,16 @@ def test_what_the_logs_of_a_gimbal_and_an_actor_lose_is_counted(tmp_path: Path) 
     angles = [(0.0, 0.0, 0.0, 1.0)] * len(flight.t_ns)
     angles[3], angles[7] = (float("nan"), 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.5)
     entries = [
-        Entry(
-            "/gimbal",
-            "geometry_msgs/msg/QuaternionStamped",
-            int(stamp_ns),
-            {"header": header(int(stamp_ns), ""), "quaternion": dict(zip("xyzw", turned, strict=True))},
-        )
+        attitude_entry("/gimbal", stamp_ns, turned)
         for stamp_ns, turned in zip(flight.t_ns, angles, strict=True)
     ]
     write_log(tmp_path, "gimbal", "mcap-cdr", entries)
     camera["pose"] |= {"of": "body"}
     camera["gimbal"] = {"file": "gimbal.mcap", "topic": "/gimbal", "relative_to": "world"}
+    places = [(float("nan") if row == 9 else 47.5, 8.25, 400.0) for row in range(len(flight.t_ns))]
     fixes = [
-        Entry(
-            "/tag",
-            "sensor_msgs/msg/NavSatFix",
-            int(stamp_ns),
-            {
-                "header": header(int(stamp_ns), ""),
-                "status": {"status": -1 if row in {2, 5, 6} else 0},
-                "latitude": float("nan") if row == 9 else 47.5,
-                "longitude": 8.25,
-                "altitude": 400.0,
-            },
-        )
-        for row, stamp_ns in enumerate(flight.t_ns)
+        fix_entry("/tag", stamp_ns, place, status=-1 if row in {2, 5, 6} else 0)
+        for row, (stamp_ns, place) in enumerate(zip(flight.t_ns, places, strict=True))
     ]
     write_log(tmp_path, "tag", "ros1", fixes)
     flight.settings["actor"] = {"file": "tag.bag", "topic": "/tag"}

@@ -20,8 +20,8 @@ from pipelines.session.records import Trajectory
 from pipelines.session.stages import StageRecord, locked
 from pipelines.session.tables import trajectory_from
 from tests.keypoints.spotted_flights import CAMERAS, FPS, LENS, START_S, spot_detector, write_spotted_flight
-from tests.synthetic.logged_flights import header
-from tests.synthetic.logs import Entry, write_log
+from tests.synthetic.logged_flights import pose_entry
+from tests.synthetic.logs import write_log
 
 FRAMES = 3
 NOISE = {"white": {"position_m": 0.4, "rotation_deg": 2.0}, "bias": {"position_m": 0.3}}
@@ -40,11 +40,7 @@ class Flight:
     def log_actor(self, point: str, height_m: float) -> None:
         """Log an actor who stands in the origin, where both cameras look at 1 m height."""
         stamps = [START_S * 10**9 + round(k * 1e9 / FPS) for k in range(FRAMES)]
-        pose = {"position": {"x": 0.0, "y": 0.0, "z": height_m}, "orientation": {"w": 1.0}}
-        entries = [
-            Entry("/actor", "geometry_msgs/msg/PoseStamped", t, {"header": header(t, "map"), "pose": pose})
-            for t in stamps
-        ]
+        entries = [pose_entry("/actor", t, (0.0, 0.0, height_m)) for t in stamps]
         write_log(self.folder, "actor", "mcap-cdr", entries)
         self.settings["actor"] = {"file": "actor.mcap", "topic": "/actor", "point": point}
 

@@ -28,7 +28,7 @@ from tests.synthetic.drone_logs import (
     write_ulog,
 )
 from tests.synthetic.flights import SyntheticFlight, write_flight
-from tests.synthetic.logged_flights import header
+from tests.synthetic.logged_flights import attitude_entry, fix_entry, header, turned
 from tests.synthetic.logs import Entry, write_log
 
 WORLD = {
@@ -114,23 +114,11 @@ def _osdk(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     entries: list[Entry] = []
     for row, stamp_ns in enumerate(truth.t_ns.tolist()):
         yaw, pitch, roll = truth.gimbal_ypr_deg[row].tolist()
+        angles = {"header": header(stamp_ns, ""), "vector": {"x": pitch, "y": roll, "z": yaw}}
         entries += [
-            Entry("/dji_sdk/gps_position", "sensor_msgs/msg/NavSatFix", stamp_ns, _fix(truth, row)),
-            Entry(
-                "/dji_sdk/attitude",
-                "geometry_msgs/msg/QuaternionStamped",
-                stamp_ns,
-                {
-                    "header": header(stamp_ns, "/body_FLU"),
-                    "quaternion": dict(zip("xyzw", truth.body[row].tolist(), strict=True)),
-                },
-            ),
-            Entry(
-                "/dji_sdk/gimbal_angle",
-                "geometry_msgs/msg/Vector3Stamped",
-                stamp_ns,
-                {"header": header(stamp_ns, ""), "vector": {"x": pitch, "y": roll, "z": yaw}},
-            ),
+            fix_entry("/dji_sdk/gps_position", stamp_ns, _place(truth, row)),
+            attitude_entry("/dji_sdk/attitude", stamp_ns, truth.body[row]),
+            Entry("/dji_sdk/gimbal_angle", "geometry_msgs/msg/Vector3Stamped", stamp_ns, angles),
         ]
     write_log(folder, name, "ros1", entries)
     return {"file": f"{name}.bag", "topic": "/dji_sdk/gps_position", "attitude": "/dji_sdk/attitude"}
@@ -161,13 +149,8 @@ def _tlog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     return {"file": f"{name}.tlog"}
 
 
-def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
-    return {
-        "header": header(int(truth.t_ns[row]), "/gps"),
-        "latitude": truth.latitude_deg[row],
-        "longitude": truth.longitude_deg[row],
-        "altitude": truth.altitude_m[row],
-    }
+def _place(truth: DroneTruth, row: int) -> tuple[float, ...]:
+    return truth.latitude_deg[row], truth.longitude_deg[row], truth.altitude_m[row]
 
 
 @pytest.mark.parametrize(
@@ -189,9 +172,6 @@ def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: flo
         off_m, off_deg = errors(flight, k)
         assert off_m < metres
         assert off_deg < degrees
-
-
-UTM = np.array([512_767.0, 5_403_710.0, 0.0])  # where the cloud below lies, zone 32N
 
 
 def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:
@@ -216,17 +196,7 @@ def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers
     hip = flight.position[:, [flight.joints.index(f"{side}_hip") for side in ("left", "right")]].mean(axis=1)
     places = [place_at(row, HOME) for row in hip]
     entries = [
-        Entry(
-            "/tag",
-            "sensor_msgs/msg/NavSatFix",
-            int(t),
-            {
-                "header": header(int(t), ""),
-                "latitude": place.latitude_deg,
-                "longitude": place.longitude_deg,
-                "altitude": place.altitude_m,
-            },
-        )
+        fix_entry("/tag", t, (place.latitude_deg, place.longitude_deg, place.altitude_m))
         for t, place in zip(flight.t_ns, places, strict=True)
     ]
     write_log(tmp_path, "tag", "ros1", entries)
@@ -260,11 +230,11 @@ def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers
 def _any_driver(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
     entries: list[Entry] = []
     for row, stamp_ns in enumerate(truth.t_ns.tolist()):
-        turned = dict(zip("xyzw", truth.body[row].tolist(), strict=True))
         stamped = header(stamp_ns, "")
+        imu = {"header": stamped, "orientation": turned(truth.body[row])}
         entries += [
-            Entry("/fix", "sensor_msgs/msg/NavSatFix", stamp_ns, _fix(truth, row)),
-            Entry("/imu", "sensor_msgs/msg/Imu", stamp_ns, {"header": stamped, "orientation": turned}),
+            fix_entry("/fix", stamp_ns, _place(truth, row)),
+            Entry("/imu", "sensor_msgs/msg/Imu", stamp_ns, imu),
             Entry("/picture", "sensor_msgs/msg/CompressedImage", stamp_ns, {"header": stamped}),
         ]
     write_log(folder, name, "ros1", entries)

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.geometry.cameras import camera_matrix
 from pipelines.session.description import read_description
-from tests.commands.runner import ingested, refused, succeeds
+from tests.commands.runner import ingested, refused
 from tests.synthetic.flights import LENS, write_flight
 
 SIZE = [LENS.width, LENS.height]

@@ -26,7 +26,7 @@ from tests.synthetic.drone_logs import (
     write_ulog,
 )
 from tests.synthetic.flights import LENS, START_NS, write_flight
-from tests.synthetic.logged_flights import header
+from tests.synthetic.logged_flights import fix_entry, header
 from tests.synthetic.logs import Entry, write_log, write_mcap
 from tests.synthetic.map_logs import grid_entry
 from tests.synthetic.video_tracks import write_gopro
@@ -201,11 +201,8 @@ def test_a_watch_beside_a_drone_on_earth_is_the_actor(tmp_path: Path) -> None:
     truth = drone_of(write_flight(tmp_path / "x", cameras=1, seconds=1.0, clean=True), 0)
     shutil.rmtree(tmp_path / "x")
     write_ulog(tmp_path / "drone1.ulg", ulog_rows(truth))
-    fixes = [
-        Entry("/fix", "sensor_msgs/msg/NavSatFix", t, {
-            "header": header(t, "gps"), "latitude": 40.4433, "longitude": -79.9436, "altitude": 280.0})
-        for t in range(START_NS, START_NS + 10**9, 10**8)
-    ]  # fmt: skip
+    place = 40.4433, -79.9436, 280.0
+    fixes = [fix_entry("/fix", t, place) for t in range(START_NS, START_NS + 10**9, 10**8)]
     for name in ("watch", "mast"):
         write_log(tmp_path, name, "ros1", fixes)
     write_pictures(tmp_path, "drone1")

@@ -26,8 +26,8 @@ from tests.synthetic.drone_logs import (
     write_dataflash,
     write_ulog,
 )
-from tests.synthetic.logged_flights import header
-from tests.synthetic.logs import Entry, write_mcap
+from tests.synthetic.logged_flights import pose_entry
+from tests.synthetic.logs import write_mcap
 from tests.synthetic.videos import even_ticks, write_video
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
@@ -80,12 +80,7 @@ def write_topics(path: Path, names: list[str]) -> None:
         for t, at, turned in zip(
             flown.t_ns.tolist(), flown.position.tolist(), flown.quaternion_xyzw.tolist(), strict=True
         ):
-            pose = {
-                "position": dict(zip("xyz", at, strict=True)),
-                "orientation": dict(zip("xyzw", turned, strict=True)),
-            }
-            stamped = {"header": header(t, "map"), "pose": pose}
-            entries.append(Entry(f"/{name}/camera_pose", "geometry_msgs/msg/PoseStamped", t, stamped))
+            entries.append(pose_entry(f"/{name}/camera_pose", t, at, turned))
     write_mcap(path, sorted(entries, key=lambda entry: entry.stamp_ns))
 
 

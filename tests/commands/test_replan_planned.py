@@ -16,7 +16,8 @@ from pipelines.geometry.arrays import Float
 from pipelines.session.storage import read_json
 from tests.commands.runner import refused, result_of, succeeds
 from tests.commands.test_replan import CALM, session_of
-from tests.synthetic.logs import Entry, write_log
+from tests.synthetic.logged_flights import pose_entry
+from tests.synthetic.logs import write_log
 
 TILT_DEG, RANGE_M = 40.0, 8.0
 
@@ -32,9 +33,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     entries = []
     for k, stamp in enumerate(t_ns.tolist()):
         at = hips[k] + [level, 0.0, up]
-        pose = {"position": dict(zip("xyz", at.tolist(), strict=True)), "orientation": {"w": 1.0}}
-        fields = {"header": {"stamp": stamp, "frame_id": "world"}, "pose": pose}
-        entries.append(Entry("/drone1/setpoint", "geometry_msgs/msg/PoseStamped", stamp, fields))
+        entries.append(pose_entry("/drone1/setpoint", stamp, at.tolist()))
     write_log(flight, "planner", "mcap-cdr", entries)
     rows = [
         f"{stamp // 10**9}.{stamp % 10**9:09d} {x:.6f} {y + level:.6f} {z + up:.6f} 0 0 0 1"

@@ -21,7 +21,7 @@ import numpy as np
 from backports import zstd
 
 from tests.formats.calibrations import test_anipose_toml
-from tests.synthetic import drone_logs, video_tracks, videos
+from tests.synthetic import drone_logs, videos
 from tests.synthetic.flights import write_flight
 
 MB = 1 << 20
@@ -414,24 +414,6 @@ def _bvh() -> Iterator[_Input]:
     yield "10^9 frames stated", motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000")
 
 
-@_kind("skeletons: C3D, TRC", "trc", "a.trc")
-def _skeletons() -> Iterator[_Input]:
-    head = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n"
-    text = f"{head}60\t60\t1\t{2**62}\tmm\nFrame#\tTime\ta\n\t\tX1\tY1\tZ1\n\n1\t0.0\t1\t2\t3\n"
-    yield "TRC: 2^62 markers stated", text
-    c3d = bytearray(512 * 2)
-    c3d[:2] = b"\x02\x50"
-    struct.pack_into(
-        "<HHHHHfHHf", c3d, 2, 65535, 65535, 1, 65535, 10, -1.0, 3, 4, 1e-30
-    )  # counts, first and last frame
-    c3d[512:516] = b"\0\0\xff\x54"
-    yield "C3D: 65,535 points in 65,535 frames", "c3d", "a.c3d", bytes(c3d)
-    struct.pack_into("<HHHHHf", c3d, 2, 1, 0, 1, 1, 10, -1.0)
-    looped = bytearray(c3d)
-    looped[516:524] = struct.pack("<bbBBhbb", 5, 1, 65, 65, 0, 0, 0)
-    yield "C3D: a parameter that leads to itself", "c3d", "a.c3d", bytes(looped)
-
-
 # --- maps ----------------------------------------
 
 
@@ -527,15 +509,6 @@ def _pictures() -> Iterator[_Input]:
     struct.pack_into(">I", lied, 29, zlib.crc32(bytes(lied[12:29])))
     yield "PNG that states 2^31 - 1", film(bytes(lied))
 
-    def jpeg(tags: bytes) -> bytes:
-        exif = b"Exif\0\0II*\0" + struct.pack("<I", 8) + tags
-        return b"\xff\xd8\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + b"\xff\xd9"
-
-    looped = struct.pack("<H", 1) + struct.pack("<HHII", 0x8769, 4, 1, 8) + struct.pack("<I", 8)
-    yield "EXIF that leads to itself", "picture_tags", "film", film(jpeg(looped), suffix="jpg")
-    counted = struct.pack("<H", 1) + struct.pack("<HHII", 0x0132, 2, 2**32 - 1, 0) + bytes(4)
-    yield "EXIF of 2^32 - 1 letters", "picture_tags", "film", film(jpeg(counted), suffix="jpg")
-
 
 @_kind("videos: boxes", "video", "a.mp4")
 def _boxes() -> Iterator[_Input]:
@@ -600,21 +573,3 @@ def _telemetry() -> Iterator[_Input]:
     yield "SRT: 200,000 cues that go back", cues
     one = cue.format(k=1, a=0, b=33)
     yield "SRT: 1,000,000 brackets", one + "2\n00:00:01,000 --> 00:00:02,000\n" + "[" * 1_000_000
-
-
-@_kind("telemetry in videos", "gopro", "a.mp4")
-def _tracks() -> Iterator[_Input]:
-    def gpmf(content: bytes) -> Writer:
-        return lambda folder: video_tracks.write_track(folder / "a.mp4", [(0, content), (10**9, content)])
-
-    def item(key: bytes, kind: bytes, size: int, count: int, data: bytes) -> bytes:
-        return key + kind + struct.pack(">BH", size, count) + data + bytes(-len(data) % 4)
-
-    deep = b""
-    for _ in range(7000):
-        deep = item(b"DEVC", b"\0", 1, len(deep), deep) if len(deep) < 60_000 else deep
-    yield "GPMF: nested 7,000 deep", gpmf(deep)
-    empty = item(b"DEVC", b"\0", 1, 60_000, item(b"STRM", b"\0", 0, 0, b"") * 7500)
-    yield "GPMF: 7,500 empty streams", gpmf(empty)
-    types = item(b"TYPE", b"c", 1, 60, b"l[99999999]" * 5) + item(b"SYST", b"?", 255, 1, bytes(255))
-    yield "GPMF: a type of 10^8 numbers", gpmf(item(b"DEVC", b"\0", 1, len(types), types))

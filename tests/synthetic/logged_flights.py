@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,21 +62,48 @@ def header(stamp_ns: int, frame: str) -> dict[str, Any]:
     return {"stamp": stamp_ns, "frame_id": frame}
 
 
+def pose_fields(position: Sequence[float], quaternion: Sequence[float] = (0, 0, 0, 1)) -> dict[str, Any]:
+    """Build a geometry_msgs/Pose of a position and a quaternion, x y z w."""
+    return {"position": dict(zip("xyz", position, strict=True)), "orientation": turned(quaternion)}
+
+
+def turned(quaternion: Sequence[float]) -> dict[str, float]:
+    """Build a geometry_msgs/Quaternion."""
+    return dict(zip("xyzw", map(float, quaternion), strict=True))
+
+
+def pose_entry(
+    topic: str, stamp_ns: int, position: Sequence[float], quaternion: Sequence[float] = (0, 0, 0, 1)
+) -> Entry:
+    """Build a pose in the frame `map`."""
+    fields = {"header": header(int(stamp_ns), "map"), "pose": pose_fields(position, quaternion)}
+    return Entry(topic, "geometry_msgs/msg/PoseStamped", int(stamp_ns), fields)
+
+
+def attitude_entry(topic: str, stamp_ns: int, quaternion: Sequence[float]) -> Entry:
+    """Build an attitude without a frame."""
+    fields = {"header": header(int(stamp_ns), ""), "quaternion": turned(quaternion)}
+    return Entry(topic, "geometry_msgs/msg/QuaternionStamped", int(stamp_ns), fields)
+
+
+def fix_entry(topic: str, stamp_ns: int, place: Sequence[float], status: int = 0) -> Entry:
+    """Build a fix of a receiver at latitude, longitude and altitude."""
+    fields = dict(zip(("latitude", "longitude", "altitude"), place, strict=True))
+    about = {"header": header(int(stamp_ns), "gps"), "status": {"status": status}}
+    return Entry(topic, "sensor_msgs/msg/NavSatFix", int(stamp_ns), about | fields)
+
+
 def _odometry(flight: SyntheticFlight, k: int, name: str, jump_s: float) -> list[Entry]:
     camera_from_body = invert(np.array(LEVER_ARM), body_from_camera("forward", 30.0))
     position, quaternion = compose((flight.camera_position[k], flight.camera_quaternion[k]), camera_from_body)
     entries = []
     jump_at = 3 * len(flight.t_ns) // 4
-    for row, (stamp_ns, at, turned) in enumerate(zip(flight.t_ns, position, quaternion, strict=True)):
+    for row, (stamp_ns, at, rotation) in enumerate(zip(flight.t_ns, position, quaternion, strict=True)):
         stated_ns = int(stamp_ns) + (round(jump_s * 1e9) if row >= jump_at else 0)
-        pose = {
-            "position": dict(zip("xyz", at.tolist(), strict=True)),
-            "orientation": dict(zip("xyzw", turned.tolist(), strict=True)),
-        }
         fields = {
             "header": header(stated_ns, "map"),
             "child_frame_id": f"{name}/base_link",
-            "pose": {"pose": pose, "covariance": _covariance()},
+            "pose": {"pose": pose_fields(at, rotation), "covariance": _covariance()},
         }
         received = int(stamp_ns) + LATE_NS
         entries.append(Entry(f"/{name}/odometry", "nav_msgs/msg/Odometry", received, fields))
