@@ -29,7 +29,7 @@ from pipelines.reconstruction.loading import load_cameras
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.memory import return_freed_arrays
+from pipelines.session.parallel import return_freed_arrays
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Session, StageRecord, WritableSession, copy_session, locked, open_session

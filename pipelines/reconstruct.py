@@ -109,7 +109,7 @@ from pipelines.session.description import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
-from pipelines.session.memory import Waiting, return_freed_arrays
+from pipelines.session.parallel import Waiting, return_freed_arrays
 from pipelines.session.people import LoggedActor, logged_people, true_joints_at
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion

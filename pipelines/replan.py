@@ -43,7 +43,7 @@ from pipelines.planning.scene import (
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
-from pipelines.session.memory import return_freed_arrays, return_unused
+from pipelines.session.parallel import return_freed_arrays, return_unused
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Stage, StageRecord, WritableSession, key_of, locked, usable_record
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json

@@ -28,7 +28,7 @@ from pipelines.reporting.studies import draw_study, study_blocks
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
-from pipelines.session.memory import return_freed_arrays, return_unused
+from pipelines.session.parallel import return_freed_arrays, return_unused
 from pipelines.session.records import Occupancy
 from pipelines.session.stages import (
     Session,

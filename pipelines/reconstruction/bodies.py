@@ -32,6 +32,7 @@ _UNKNOWN_M2 = 1e4
 _COMPARED_TIMES = 100
 # Between true poses further apart nothing is interpolated.
 _LONGEST_STEP_NS = 200_000_000
+# A table of this many times has 16 MB for each person.
 _TIMES_AT_ONCE = 4096
 
 

@@ -34,8 +34,9 @@ from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES
 
 _TABLE = Path(__file__).parent / "data" / "landmarks.csv"
 
-# The trunk's joints give the first pose; with fewer other joints, limbs would be of the prior alone.
+# The trunk's joints give the first pose.
 _TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+# With fewer joints, limbs would be of the prior alone.
 MIN_LANDMARKS = 10
 # A detector's errors have an autocorrelation of 0.1 after this time on the tuning flights.
 _INDEPENDENT_S = 0.4

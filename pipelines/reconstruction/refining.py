@@ -54,8 +54,7 @@ from pipelines.reconstruction.refinement.system import Sighting
 from pipelines.reconstruction.results import poses_table
 from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
-from pipelines.session.memory import Waiting, available_bytes
-from pipelines.session.parallel import each_part
+from pipelines.session.parallel import Waiting, available_bytes, each_part
 from pipelines.session.people import bones_of
 
 if TYPE_CHECKING:

@@ -428,24 +428,15 @@ def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = 
 
 def load_bodies(bodies_path: Path, shapes_path: Path) -> list[MovingBody]:
     """Load the bodies of tables of `tables.BODY` and `tables.BODY_SHAPE`, one of each person with rows."""
-    from pipelines.geometry.body_model import SHAPE
-    from pipelines.geometry.rig import BONES
-
     table, shapes = read_table(bodies_path, BODY), read_table(shapes_path, BODY_SHAPE)
     bodies = []
     for person in np.unique(table["person"].to_numpy(np.int64)).tolist():
-        own = table[table["person"] == person]
-        numbers = shapes[shapes["person"] == person].set_index("number")["value"]
-        rows = own.sort_values("t_ns", kind="stable")
-        bodies.append(
-            MovingBody(
-                person,
-                rows["t_ns"].to_numpy(np.int64)[:: len(BONES)],
-                numbers.loc[list(SHAPE)].to_numpy(np.float64),
-                rows[["x", "y", "z"]].to_numpy(np.float64).reshape(-1, len(BONES), 3),
-                rows[["qx", "qy", "qz", "qw"]].to_numpy(np.float64).reshape(-1, len(BONES), 4),
-            )
-        )
+        rows = table[table["person"] == person].sort_values("t_ns", kind="stable")
+        numbers = shapes.loc[shapes["person"] == person, "value"].to_numpy(np.float64)
+        t_ns = np.unique(rows["t_ns"].to_numpy(np.int64))
+        centre = rows[["x", "y", "z"]].to_numpy(np.float64).reshape(len(t_ns), -1, 3)
+        turn = rows[["qx", "qy", "qz", "qw"]].to_numpy(np.float64).reshape(len(t_ns), -1, 4)
+        bodies.append(MovingBody(person, t_ns, numbers, centre, turn))
     return bodies
 
 

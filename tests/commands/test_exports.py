@@ -12,8 +12,7 @@ from rosbags.highlevel import AnyReader
 
 from pipelines.export import export, load_recording
 from pipelines.formats.skeletons import c3d, joint_files, trc
-from pipelines.formats.skeletons.joint_angle_files import write_sto
-from pipelines.formats.skeletons.joint_files import at_even_times
+from pipelines.formats.skeletons.joint_files import at_even_times, write_sto
 from pipelines.geometry.joint_angles import ANGLES
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion

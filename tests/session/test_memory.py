@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
-from pipelines.session.memory import Waiting
+from pipelines.session.parallel import Waiting
 
 
 @dataclass(frozen=True)

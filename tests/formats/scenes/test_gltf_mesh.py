@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipelines.formats.scenes.gltf_mesh import EXPORT
+from pipelines.formats.scenes.gltf_writing import MESH_EXPORT
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.body_model import body_model, shape_of
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
@@ -42,7 +42,7 @@ def body_of(t_ns: np.ndarray[Any, Any]) -> MovingBody:
 def test_the_skin_of_the_file_is_the_surface_of_the_model(tmp_path: Path) -> None:
     motion = walking(60)
     body = body_of(motion.t_ns)
-    (path,) = EXPORT.write(replace(recording(), motion=motion, bodies=lambda: [body]), tmp_path)
+    (path,) = MESH_EXPORT.write(replace(recording(), motion=motion, bodies=lambda: [body]), tmp_path)
     data = path.read_bytes()
     size = struct.unpack("<I", data[12:16])[0]
     document, buffer = json.loads(data[20 : 20 + size]), data[28 + size :]
@@ -95,5 +95,5 @@ def test_the_skin_of_the_file_is_the_surface_of_the_model(tmp_path: Path) -> Non
 
 def test_without_a_body_there_is_nothing_to_export(tmp_path: Path) -> None:
     with pytest.raises(DataError) as error:
-        EXPORT.write(recording(), tmp_path)
+        MESH_EXPORT.write(recording(), tmp_path)
     assert error.value.code == "no-body"
