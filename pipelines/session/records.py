@@ -269,7 +269,6 @@ class VideoIndex:
     height: int
     rotation_deg: int  # 0, 90, 180 or 270: how far the coded picture is turned counter-clockwise to show it
     codec: str
-    variable: bool  # True if k / rate_hz is further from pts_ns[k] than the container's clock explains
     dropped: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # on what was assumed
 

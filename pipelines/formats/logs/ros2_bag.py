@@ -14,7 +14,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -92,13 +92,9 @@ class Ros2Bag:
             return False
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Describe messages, times, storage, topics, losses, and differences from metadata.yaml."""
+        """Describe messages, times, storage, topics, and losses."""
         with self.open_log([path]) as log:
-            facts = log.describe()
-        times = _contents(path).times
-        if facts["messages"] and times != {key: facts[key] for key in times}:
-            facts["metadata.yaml states"] = times
-        return facts
+            return log.describe()
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open a bag's folder, or its files."""
@@ -119,7 +115,6 @@ class _BagFiles:
     files: list[Path]
     lost: Counter[str]
     messages: int | None = None
-    times: dict[str, object] = field(default_factory=dict)  # first_ns and span_s
 
 
 def _open_part(path: Path) -> LogPart:
@@ -215,12 +210,8 @@ def _read_metadata(folder: Path) -> _BagFiles:
     with path.open(encoding="utf-8") as file:
         content: Any = plain_yaml(path, file.read(_METADATA_LIMIT))
     information = content[_INFORMATION]
-    times: dict[str, object] = {
-        "first_ns": int(information["starting_time"]["nanoseconds_since_epoch"]),
-        "span_s": int(information["duration"]["nanoseconds"]) / 1e9,
-    }
     files = [folder / PurePath(str(name)).name for name in information["relative_file_paths"]]
-    return _BagFiles(files, Counter(), int(information["message_count"]), times)
+    return _BagFiles(files, Counter(), int(information["message_count"]))
 
 
 def _states_a_bag(metadata: Path) -> bool:

@@ -167,17 +167,10 @@ def _read_subtitles(path: Path) -> FrameStamps:
             code="clock-unknown",
         )
     if subtitles.are_slow:  # with whole seconds: not the time of each frame
-        raise DataError(
-            path,
-            f"shows a time every {np.median(np.diff(media_ns)) / 1e9:g} s, not for each frame",
-            f"write frame_times: {{start: {_plain_seconds(start_ns)}}} and let clock.sigma_s be 1",
-        )
+        problem = f"shows a time every {np.median(np.diff(media_ns)) / 1e9:g} s, not for each frame"
+        start = format_seconds(np.array([start_ns]))[0]
+        raise DataError(path, problem, f"write frame_times: {{start: {start}}} and let clock.sigma_s be 1")
     return _clean(path, _slots(media_ns), subtitles.clock_ns, media_ns, {"no time": ~known}, {})
-
-
-def _plain_seconds(t_ns: int) -> str:
-    """Format seconds without trailing zeros."""
-    return format_seconds(np.array([t_ns]))[0].rstrip("0").rstrip(".")
 
 
 def _slots(media_ns: Int64) -> Int64:

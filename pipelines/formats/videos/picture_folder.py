@@ -209,7 +209,6 @@ class PictureFolder:
             height=first.shape[0],
             rotation_deg=0,
             codec=UNTIMED if times is None else SHARED_SECONDS if shared else "pictures",
-            variable=times is not None,
         )
 
 

@@ -114,7 +114,6 @@ class VideoContainer:
             "frames": index.count,
             "span_s": times["span_s"],
             "rate_hz": None if index.rate_hz is None else round(index.rate_hz, 3),
-            "rate": "variable" if index.variable else "constant",
             **{key: times[key] for key in ("gaps", "longest_gap_s") if key in times},
             "start_s": round(index.start_ns / 1e9, 6),
             **({"created_s": made / 1e9} if (made := created_ns(path)) is not None else {}),
@@ -408,7 +407,6 @@ def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
         height=height,
         rotation_deg=turned,
         codec=UNTIMED if scan.is_raw else stream.codec_context.codec.canonical_name,
-        variable=_is_variable(scan.ticks),
         dropped=scan.dropped,
         notes=notes,
     )
@@ -420,15 +418,6 @@ def _nanoseconds(ticks: Int64, tick_s: Fraction, origin: int = 0) -> Int64:
     return np.array(
         [(2 * (t - origin) * above + below) // (2 * below) for t in ticks.tolist()], dtype=np.int64
     )
-
-
-def _is_variable(ticks: Int64) -> bool:
-    """Return True if a frame deviates from the even grid by more than one tick and 1 % of a frame."""
-    count = len(ticks)
-    if count < 3:
-        return False
-    even = np.linspace(0.0, float(ticks[-1] - ticks[0]), count)
-    return bool(np.abs(ticks - ticks[0] - even).max() > max(1.0, 0.01 * even[1]))
 
 
 # --- decoding -----------------------------------------------------------------------------------------

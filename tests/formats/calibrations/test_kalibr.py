@@ -9,9 +9,7 @@ import pytest
 from pipelines.formats.calibrations import calibration_files
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, CalibrationFormat
-from tests.commands.runner import mocap
 from tests.real_data import real_data
-from tests.synthetic.flights import write_flight
 
 READER: CalibrationFormat = calibration_files.KALIBR
 CAMERA = {
@@ -72,14 +70,3 @@ def test_faulty_content_is_refused(tmp_path: Path, keys: dict[str, str | None]) 
 def test_the_offset_of_its_clock_is_named(tmp_path: Path) -> None:
     cameras = READER.read_calibration(chain(tmp_path / "chain.yaml", timeshift_cam_imu="0.0123"))
     assert all("0.0123 s" in camera.note for camera in cameras.values())
-
-
-def test_ingest_says_that_the_offset_is_not_used(tmp_path: Path) -> None:
-    flight = write_flight(tmp_path, cameras=1, seconds=0.1)
-    settings = flight.settings["cameras"]["drone1"]
-    size = [settings["intrinsics"][side] for side in ("width", "height")]
-    path = chain(tmp_path / "chain.yaml", timeshift_cam_imu="0.0123", resolution=str(size))
-    settings["intrinsics"] = {"file": path.name, "camera": "cam0"}
-    flight.save()
-    result = mocap("ingest", flight.manifest)
-    assert "timeshift_cam_imu" in result.stderr

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pipelines.formats.keypoint_files.result_files import ALPHAPOSE as FORMAT
-from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS
 from tests.real_data import real_data
 
@@ -44,25 +43,6 @@ def test_the_real_file_holds_what_is_known_of_it() -> None:
     # Everybody's idx is 0 (no tracker). The second person of a frame must not count as a repeat of the first.
     assert found.dropped == {}
     assert sorted(set(found.person.tolist())) == [0, 1]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        [],
-        [entry("1.jpg", count=19)],
-        [entry("a/1.jpg"), entry("b/1.jpg")],
-        [{"image_id": "1.jpg", "keypoints": ["x", {}, []]}],
-        [{"image_id": "1.jpg", "keypoints": [0.0] * 51}],
-        {"a": 1},
-    ],
-)
-def test_bad_content_is_one_clear_line(tmp_path: Path, content: object) -> None:
-    path = written(tmp_path, content)
-    with pytest.raises(DataError) as caught:
-        FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("people", "keypoints"), [("bodies", "joints"), ("people", "pose_keypoints_2d")])

@@ -21,7 +21,6 @@ from pipelines.formats.logs.recordings import (
 )
 from pipelines.session.errors import DataError
 from tests.formats.log_entries import (
-    PICTURE,
     POSE,
     entries,
     everything,
@@ -164,13 +163,6 @@ def records(content: bytes) -> dict[int, list[int]]:
         found.setdefault(content[position], []).append(position)
         position += 9 + int.from_bytes(content[position + 1 : position + 9], "little")
     return found
-
-
-def test_split_files_are_one_recording(tmp_path: Path) -> None:
-    paths = [write_mcap(tmp_path / f"d1_{k}.mcap", FLIGHT[k::3]) for k in range(3)]
-    with log_format(paths[0]).open_log(paths) as log:
-        stamps = [m.receive_ns for m in log.messages([POSE, PICTURE])]
-    assert stamps == sorted(e.stamp_ns for e in FLIGHT if e.topic in {POSE, PICTURE})
 
 
 @pytest.mark.parametrize("kind", [6, 7, 9, 11])

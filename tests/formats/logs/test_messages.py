@@ -66,27 +66,6 @@ def test_odometry_keeps_its_covariance_and_both_frames(version: str) -> None:
 
 
 @both_ros
-def test_stamped_poses(version: str) -> None:
-    stamped = ros(
-        version,
-        "geometry_msgs/msg/PoseStamped",
-        header=header(version, STAMP),
-        pose=pose(version, POSITION, QUATERNION),
-    )
-    sample = only(stamped, "geometry_msgs/msg/PoseStamped")
-    assert is_the_pose(sample, "world", "")
-    assert sample.covariance is None
-
-    uncertain = STORES[version].types["geometry_msgs/msg/PoseWithCovariance"](
-        pose=pose(version, POSITION, QUATERNION), covariance=COVARIANCE.ravel()
-    )
-    name = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    sample = only(ros(version, name, header=header(version, STAMP), pose=uncertain), name)
-    assert is_the_pose(sample, "world", "")
-    np.testing.assert_array_equal(sample.covariance, COVARIANCE)
-
-
-@both_ros
 @pytest.mark.parametrize("type_name", ["tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"])
 def test_transforms(version: str, type_name: str) -> None:
     stated = [
@@ -269,8 +248,3 @@ def test_what_is_no_camera_is_refused(stated: Any) -> None:
     with pytest.raises(DataError) as error:
         lens(camera_info("ros2", **stated))
     assert str(error.value).startswith("d1.mcap: ")
-
-
-# --- pictures ------------------------------------------------------------------------------------------
-
-# --- kinds and refusals --------------------------------------------------------------------------------

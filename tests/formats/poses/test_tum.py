@@ -50,13 +50,9 @@ def test_values_and_exact_stamps(tmp_path: Path) -> None:
     "header",
     [
         "# timestamp tx ty tz qw qx qy qz",
-        "#t x y z qw qx qy qz",
         "# format: timestamp [s] tx [m] ty [m] tz [m] qw qx qy qz (body in world)",
         "# t x y z w x y z",
-        "# timestamp, tx, ty, tz, qw, qx, qy, qz",
-        "timestamp tx ty tz qw qx qy qz",
         "timestamp,tx,ty,tz,qw,qx,qy,qz",
-        "# time px py pz qw qx qy qz",
         "# made by SLAM\n# timestamp(s) p_x p_y p_z q_w q_x q_y q_z\n# 2 poses",
     ],
 )

@@ -63,7 +63,6 @@ def test_stamps_are_those_written(tmp_path: Path, ticks: list[int], b_frames: in
     index = READER.index(path)
     assert index.pts_ns.tolist() == relative_ns(ticks)
     assert index.start_ns == 0
-    assert index.variable == (ticks == uneven_ticks(40))
     assert index.rate_hz == pytest.approx(39 / ((ticks[-1] - ticks[0]) / 90_000), rel=1e-9)
     assert (index.width, index.height, index.codec, index.rotation_deg) == (*SIZE, "h264", 0)
     assert index.dropped == {}
@@ -89,7 +88,6 @@ def test_frames_that_vp9_never_shows_are_none() -> None:
         assert reader.index.count == len(pictures) == 72
         assert reader.index.dropped == {}
         np.testing.assert_allclose(reader.index.pts_ns / 1e6, milliseconds, rtol=0, atol=1e-6)
-        assert not reader.index.variable
         mine = dict(reader.frames())
         assert (sorted(mine), reader.missing) == (list(range(72)), set())
     # The two conversions of ten bits to eight differ by levels at edges; another frame differs far more.
