@@ -37,7 +37,7 @@ class _ListsFormats(click.Command):
             formatter.write_dl(rows)
 
 
-@click.command("export", cls=_ListsFormats, short_help="Write TRC, C3D, BVH, CSV, TUM, MCAP, Rerun.")
+@click.command("export", cls=_ListsFormats, short_help="Write TRC, C3D, BVH, CSV, MCAP, missions.")
 @each("session", "SESSION", suffix=".export")
 @click.option(
     "--to",
