@@ -4,6 +4,7 @@ import errno
 import os
 import signal
 import sys
+from types import FrameType
 from typing import Any
 
 # Shells expect this exit status after Ctrl-C.
@@ -16,6 +17,15 @@ def _leave_at_once(*_: object) -> None:
     if sys.stderr is not None:
         os.write(2, f"{_CONTINUES}\n".encode())
     os._exit(_INTERRUPTED)
+
+
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, but leave at once while a module is loaded: compiled ones may lose it."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            _leave_at_once()
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 _is_script = os.path.basename(sys.argv[0]) == "mocap"  # noqa: PTH119  # pathlib takes a while to import
@@ -126,7 +136,7 @@ class _Lazy(Mocap):
             module = name.replace("-", "_")
             self.add_command(getattr(import_module(f"mocap_cli.{module}"), f"{module}_command"))
         if signal.getsignal(signal.SIGINT) is _leave_at_once:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGINT, _interrupt)
         return super().get_command(ctx, cmd_name)
 
 
