@@ -69,8 +69,7 @@ def check(
         detector: looks at pictures without keypoints.
         workers: the number of threads; the result does not depend on it.
 
-    Raises:
-        DataError: the flight cannot be read, or nobody is seen.
+    DataError: the flight cannot be read, or nobody is seen.
     """
     progress = progress or Silent()
     return_freed_arrays()
@@ -102,8 +101,7 @@ def fix(manifest: Path, **options: Any) -> tuple[Checked, list[str]]:
     Returns:
         The doubts that are left, and the lines of the difference; none where nothing was written.
 
-    Raises:
-        DataError: the path is a session, or the flight cannot be read.
+    DataError: the path is a session, or the flight cannot be read.
     """
     if manifest.is_dir():
         raise DataError(

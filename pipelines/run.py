@@ -41,9 +41,8 @@ def run(
         ask: decides what no file tells (see `draft`).
         workers: the number of processes; the result does not depend on it.
 
-    Raises:
-        DataError: the folder holds no flight, something is missing that only the user knows, or a stage
-            cannot do its work.
+    DataError: the folder holds no flight, something is missing that only the user knows, or a stage cannot do
+    its work.
     """
     progress = progress or Silent()
     manifest, assumed = drafted(folder, ask=ask, progress=progress)
@@ -63,8 +62,7 @@ def run(
 def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[str]]:
     """Return the manifest of a folder, drafted if there is none, and what it assumes if it was drafted.
 
-    Raises:
-        DataError: the folder holds no flight, or something is missing that only the user knows.
+    DataError: the folder holds no flight, or something is missing that only the user knows.
     """
     manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
     if manifest.exists():

@@ -92,10 +92,7 @@ def rows_to_follow(t_ns: Int64) -> Int64:
 def load_tracks(session: Path, camera: Camera) -> Followed | None:
     """Open the background of a camera, without sightings on people; None if it was not followed.
 
-    A track ends where it meets the box of a person.
-
-    Raises:
-        DataError: the file cannot be read.
+    A track ends where it meets the box of a person. DataError: the file cannot be read.
     """
     path = tracks_path(session / "background" / camera.name)
     if not path.is_file():

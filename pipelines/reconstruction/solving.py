@@ -44,8 +44,7 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_
         position: [T, C, 3] m of the cameras, NaN without a pose.
         pixel_sigma: standard deviation of a good keypoint (px).
 
-    Raises:
-        DataError: no camera has a pose at any time.
+    DataError: no camera has a pose at any time.
     """
     posed = ~np.isnan(position[..., 0])
     if not posed.any():
