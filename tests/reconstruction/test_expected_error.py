@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from pipelines.reconstruction.expected_error import GOOD_MM, USABLE_MM, verdict
+from pipelines.reconstruction.results import GOOD_MM, USABLE_MM, verdict
 
 FIGURES: dict[str, Any] = {
     "reconstructed_share": 0.99,
