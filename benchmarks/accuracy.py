@@ -3,6 +3,7 @@
 - corpus: all methods on 24 rendered flights and the sample, with the real detectors
   (`benchmarks/corpus/README.md`).
 - gimbals: real pictures that move, by virtual gimbals (`benchmarks/gimbals.py`).
+- bodies: bodies with a surface on the rendered flights (`benchmarks/bodies.py`).
 - people: several people, who is found and who is confused (`benchmarks/people.py`).
 - attitudes: attitudes from pictures where logs have places alone (`benchmarks/attitudes.py`).
 - detectors: the detectors on the sample and on a real recording, beside Pose2Sim (`benchmarks/detectors.py`).
@@ -39,7 +40,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from benchmarks import attitudes, detectors, gimbals, people
+from benchmarks import attitudes, bodies, detectors, gimbals, people
 from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
 from benchmarks.results import fixed, keep, markdown_table
@@ -449,6 +450,7 @@ SUBJECTS: dict[str, tuple[Any, Any]] = {
     "gimbals": (gimbals.add_arguments, gimbals.run),
     "attitudes": (attitudes.add_arguments, attitudes.run),
     "people": (people.add_arguments, people.run),
+    "bodies": (bodies.add_arguments, bodies.run),
     "detectors": (detectors.add_arguments, detectors.run),
 }
 

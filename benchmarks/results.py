@@ -66,6 +66,7 @@ SECTIONS = (
             Part("corpus-nothing", "The corpus, pose noise not stated", RENDERED, "each half by its name"),
             Part("corpus-parts", "What each part of `auto` adds, one draw", RENDERED, "both halves"),
             Part("angles", "Joint angles", RENDERED, KEPT),
+            Part("bodies", "Bodies with a surface, one draw, noise stated", RENDERED, KEPT),
         ),
     ),
     Section(

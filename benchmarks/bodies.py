@@ -1,0 +1,188 @@
+"""Bodies fitted to the skeletons of rendered flights: `python -m benchmarks.accuracy bodies`.
+
+The flights are those of `corpus`, first draw, with the true noise model given. Shape and rotations of the
+people are known. "Landmarks" are the skeleton's shoulders, elbows, hips, knees and ankles against the true
+joint centres, "centres" those of the body; both relative to the middle of the hips. NEES is that of vertices,
+by the covariances in body.parquet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.corpus.drawn import DrawnFlight, Poses, kept_in_place_of_pictures
+from benchmarks.corpus.stored import HALVES, Flight, flights
+from benchmarks.results import fixed, markdown_table
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.body_model import body_model
+from pipelines.geometry.poses import cross_matrix, interpolate_poses
+from pipelines.geometry.rig import BONE, BONES
+from pipelines.reconstruct import ReconstructSettings, reconstruct
+from pipelines.session.people import take_joints
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, MovingBody
+from pipelines.session.tables import (
+    BODY,
+    BODY_ROTATION_COLUMNS,
+    BODY_SHAPE,
+    SKELETON,
+    load_bodies,
+    read_motion,
+    read_table,
+)
+
+CASES: dict[str, tuple[str, Poses, str]] = {
+    "default network, logged poses, `auto`": ("blazepose", "logged", "auto"),
+    "heavy network, true poses, `robust`": ("blazepose-heavy", "true", "robust"),
+}
+CENTRES = {
+    f"{side}_{joint}": BONE[f"{side}_{bone}"]
+    for side in ("left", "right")
+    for joint, bone in (
+        ("hip", "thigh"),
+        ("shoulder", "upper_arm"),
+        ("elbow", "forearm"),
+        ("knee", "shank"),
+        ("ankle", "foot"),
+    )
+}
+_TIMES = 25  # at which surfaces are compared
+_VERTICES = 200
+
+
+@dataclass(frozen=True)
+class BodyErrors:
+    """Errors of one body."""
+
+    stature_mm: float
+    stature_sigmas: float
+    mpvpe_mm: float
+    root_mpvpe_mm: float
+    landmarks_mm: float
+    centres_mm: float
+    nees: float
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--flights", nargs="+", default=["kept"], help="tuning, kept, or names")
+
+
+def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
+    """Measure every flight; print a line for each body, and yield a table of means and medians."""
+    found: dict[tuple[str, str], list[BodyErrors]] = {}
+    for flight in flights():
+        if flight.missing_motions or not {flight.half, flight.name} & set(options.flights):
+            continue
+        for case, errors in measured(flight):
+            found.setdefault((flight.half, case), []).append(errors)
+            print(flight.name, case, *(f"{value:.1f}" for value in astuple(errors)), flush=True)
+    rows = []
+    for half in HALVES:
+        for case in CASES:
+            if own := found.get((half, case)):
+                table = np.array([astuple(errors) for errors in own])
+                mean, middle = table.mean(axis=0), np.median(table, axis=0)
+                near = 100 * float(np.mean(np.abs(table[:, 0]) < 20))
+                cells = [fixed(float(np.abs(table[:, 0]).mean())), fixed(near)]
+                cells += [f"{mean[k]:.0f} ({middle[k]:.0f})" for k in range(2, 6)]
+                rows.append([half, case, str(len(own)), *cells, fixed(float(middle[6]), 1)])
+    header = ["half", "case", "bodies", "stature error mm", "within 2 cm %", "MPVPE mm: mean (median)"]
+    header += ["MPVPE root-relative", "landmarks root-relative", "centres root-relative", "median NEES"]
+    yield "bodies", markdown_table(header, rows)
+
+
+def measured(flight: Flight) -> Iterator[tuple[str, BodyErrors]]:
+    """Reconstruct one flight in every case, and measure the bodies."""
+    with tempfile.TemporaryDirectory(prefix="bodies-") as folder:
+        drawn = DrawnFlight(flight, Path(folder) / "shared")
+        drawn.write_shared()
+        for number, (case, (detector, poses, method)) in enumerate(CASES.items()):
+            session = drawn.session(Path(folder) / str(number), 0, "model", detector, poses=poses)
+            with kept_in_place_of_pictures(flight, detector):
+                reconstruct(session, ReconstructSettings(method=method, detector=detector))  # type: ignore[arg-type]
+            for errors in errors_of(session):
+                yield case, errors
+
+
+def errors_of(session: Path) -> Iterator[BodyErrors]:
+    """Compare the bodies of a session with the nearest true ones."""
+    place = session / "reconstruct"
+    if not (place / "body.parquet").is_file():
+        return
+    table, skeleton = (
+        read_table(place / "body.parquet", BODY),
+        read_motion(place / "skeleton.parquet", SKELETON),
+    )
+    shapes = read_table(place / "body_shape.parquet", BODY_SHAPE)
+    truth = load_bodies(session / "truth_body.parquet", session / "truth_body_shape.parquet")
+    for body in load_bodies(place / "body.parquet", place / "body_shape.parquet"):
+        near = [_at(each, body) for each in truth]
+        far = [np.nanmedian(np.linalg.norm(body.centre - centre, axis=-1)) for centre, _ in near]
+        centre, rotation = near[int(np.argmin(far))]
+        shape = truth[int(np.argmin(far))].shape
+        own = table[table["person"] == body.person]
+        spread, turning = (
+            own[list(columns)]
+            .to_numpy(np.float64)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+            .reshape(-1, len(BONES), 3, 3)
+            for columns in (POINT_COVARIANCE_COLUMNS, BODY_ROTATION_COLUMNS)
+        )
+        sigma = shapes[(shapes["person"] == body.person) & (shapes["number"] == "stature_m")]["sigma"].item()
+        stature = body.shape[0] - shape[0]
+        rows = np.searchsorted(skeleton.t_ns, body.t_ns)
+        seen = take_joints(skeleton.position[rows, body.person], skeleton.joints, tuple(CENTRES))
+        bones = list(CENTRES.values())
+        landmarks, centres = (
+            1e3
+            * float(np.nanmean(np.linalg.norm(_about_hips(each) - _about_hips(centre[:, bones]), axis=-1)))
+            for each in (seen, body.centre[:, bones])
+        )
+        surface = _surface_errors(body, shape, centre, rotation, spread, turning)
+        yield BodyErrors(1e3 * stature, stature / sigma, *surface[:2], landmarks, centres, surface[2])
+
+
+def _at(truth: MovingBody, body: MovingBody) -> tuple[Float, Float]:
+    """Interpolate a true body to the times of another: centres [T, 22, 3], rotations [T, 22, 4]."""
+    limits = {"max_gap_ns": 200_000_000, "max_extrapolation_ns": 0}
+    both = [
+        interpolate_poses(truth.t_ns, truth.centre[:, bone], truth.rotation[:, bone], body.t_ns, **limits)
+        for bone in range(len(BONES))
+    ]
+    return np.stack([each[0] for each in both], axis=1), np.stack([each[1] for each in both], axis=1)
+
+
+def _about_hips(joints: Float) -> Float:
+    """Subtract the middle of the hips from joints [T, J, 3] in the order of `CENTRES`."""
+    names = list(CENTRES)
+    hips = joints[:, [names.index("left_hip"), names.index("right_hip")]]
+    relative: Float = joints - hips.mean(axis=1, keepdims=True)
+    return relative
+
+
+def _surface_errors(
+    body: MovingBody, shape: Float, centre: Float, rotation: Float, spread: Float, turning: Float
+) -> tuple[float, float, float]:
+    """Return MPVPE, its root-relative form (mm), and the NEES of vertices."""
+    model = body_model()
+    chosen = np.random.default_rng(0).choice(len(model.weights), _VERTICES, replace=False)
+    bone = model.weights[chosen].argmax(axis=1)
+    found = []
+    for k in np.unique(np.linspace(0, len(body.t_ns) - 1, _TIMES).astype(np.int64)).tolist():
+        if np.isnan(centre[k]).any():
+            continue
+        own = model.surface(body.shape, body.centre[k, 0], body.rotation[k])
+        error = own - model.surface(shape, centre[k, 0], rotation[k])
+        arm = cross_matrix(own[chosen] - body.centre[k, bone])
+        covariance = spread[k, bone] + arm @ turning[k, bone] @ np.swapaxes(arm, -1, -2)
+        white = np.linalg.solve(covariance, error[chosen][..., None])[..., 0]
+        relative = error - (body.centre[k, 0] - centre[k, 0])
+        lengths = [np.linalg.norm(each, axis=1).mean() for each in (error, relative)]
+        found.append([*lengths, np.sum(error[chosen] * white, axis=1).mean()])
+    whole, relative_mm, nees = np.mean(found, axis=0).tolist()
+    return 1e3 * whole, 1e3 * relative_mm, nees
