@@ -468,6 +468,8 @@ def _detection(content: SessionContent, camera: CameraRow) -> tuple[float | None
 # Hip to ankle is 0.491 of the stature, 1.4 to 2.05 m, by Drillis and Contini (1966): Winter, Biomechanics and
 # Motor Control of Human Movement, 4th edition, figure 4.1.
 USUAL_LEG_M = (0.69, 1.01)
+# The statures that the range of legs rests on.
+USUAL_STATURE_M = (1.4, 2.05)
 # Running people are slower than this.
 USUAL_SPEED_MPS = 8.0
 # Speeds over half a second average out the swing of the hips.
@@ -514,6 +516,13 @@ def at_a_glance(summary: Summary) -> list[Glance]:
         leg, (low, high) = float(np.nanmean(legs)), USUAL_LEG_M
         usual = f"hip to ankle; adults {low:.2f} to {high:.2f} m"
         glances.append(Glance("Legs", quantity(leg, "m", 2), usual, not low <= leg <= high))
+    bodies = section(summary.metrics, "body")
+    body = section(bodies, next(iter(bodies), ""))
+    stature_m, sigma_m = number(body, "stature_m"), number(body, "stature_sigma_m")
+    if stature_m is not None and sigma_m is not None:
+        (low, high), value = USUAL_STATURE_M, f"{stature_m:.2f} ± {sigma_m:.2f} m"
+        usual = f"of the fitted body; adults {low:.2f} to {high:.2f} m"
+        glances.append(Glance("Stature", value, usual, not low <= stature_m <= high))
     position, joints = summary.motion.measured_position[:, 0], summary.motion.joints
     hips = [joints.index(name) for name in ("left_hip", "right_hip") if name in joints]
     speed = _speeds(summary.motion.t_ns, position[:, hips].mean(axis=1)) if hips else np.empty(0)

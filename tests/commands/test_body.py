@@ -35,6 +35,7 @@ def test_a_simulated_person_gets_her_body(tmp_path: Path) -> None:
     assert abs(figures["stature_m"] - 1.62) < 3 * figures["stature_sigma_m"] < 0.08
     # Hands and feet have no landmarks among COCO's 17, and hang as they usually do.
     assert figures["root_mpvpe_mm"] < 60
+    assert figures["root_centres_mm"] < 50
     bodies = pd.read_parquet(session / "reconstruct" / "body.parquet")
     true = pd.read_parquet(session / "truth_body.parquet")
     both = bodies.merge(true, on=["t_ns", "person", "bone"], suffixes=("", "_true"))
