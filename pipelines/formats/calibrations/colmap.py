@@ -31,7 +31,7 @@ READING_TIMEOUT_S = 20.0
 # Slow disks and machines read that much; a larger file gets the time on top.
 _SLOWEST_READING_BYTES_PER_S = 2e6
 # Images need up to ten times their size in the file; damaged counts ask for terabytes.
-_MEMORY_BYTES, _MEMORY_PER_BYTE = 4 << 30, 20
+_MEMORY_BYTES, _MEMORY_PER_BYTE = 3 << 28, 20
 _FILES = ("cameras", "images")
 
 
