@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.logs.mcap_log import McapLog
 from pipelines.formats.logs.recordings import OpenLog
+from pipelines.formats.logs.trajectories import LogFile
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
@@ -23,13 +23,13 @@ from tests.synthetic.recorder_logs import CONTAINERS, RECORDER, in_a_process, in
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[OpenLog]:
     """Record the MCAP logs that are opened."""
     logs: list[OpenLog] = []
-    open_log = McapLog.open_log
+    open_log = LogFile.open_log
 
-    def remembered(self: McapLog, paths: Sequence[Path]) -> OpenLog:
+    def remembered(self: LogFile, paths: Sequence[Path]) -> OpenLog:
         logs.append(open_log(self, paths))
         return logs[-1]
 
-    monkeypatch.setattr(McapLog, "open_log", remembered)
+    monkeypatch.setattr(LogFile, "open_log", remembered)
     return logs
 
 

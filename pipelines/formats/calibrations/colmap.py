@@ -9,6 +9,7 @@ COLMAP puts (0, 0) at the corner of the top left pixel, we at its centre: cx and
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -26,7 +27,9 @@ from pipelines.geometry.arrays import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 
-# A small model takes a second, nearly all of it to import pycolmap.
+# A small model takes a second of processor time, nearly all of it to import pycolmap.
+READING_CPU_S = 5
+# A busy machine gives a process a quarter of its processor.
 READING_TIMEOUT_S = 20.0
 # Slow disks and machines read that much; a larger file gets the time on top.
 _SLOWEST_READING_BYTES_PER_S = 2e6
@@ -125,11 +128,12 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read cameras and images in a process of its own, whose messages stay away from the terminal."""
     size = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
     memory = _MEMORY_BYTES + _MEMORY_PER_BYTE * size
-    limit_s = READING_TIMEOUT_S + size / _SLOWEST_READING_BYTES_PER_S
+    more_s = math.ceil(size / _SLOWEST_READING_BYTES_PER_S)
+    limit_s, cpu_s = READING_TIMEOUT_S + more_s, READING_CPU_S + more_s
     problem = "is no COLMAP model that can be read"
     try:
         done = subprocess.run(  # noqa: S603 - our own interpreter and module
-            [sys.executable, "-m", __name__, path.absolute(), str(memory)],
+            [sys.executable, "-m", __name__, path.absolute(), str(memory), str(cpu_s)],
             capture_output=True, timeout=limit_s, check=True, text=True,
         )  # fmt: skip
         answer = json.loads(done.stdout.splitlines()[-1])
@@ -141,7 +145,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     raise damaged(path, problem)
 
 
-def _read_here(path: Path, memory: int) -> dict[str, Any]:
+def _read_here(path: Path, memory: int, cpu_s: int) -> dict[str, Any]:
     """Read a model by pycolmap; return cameras and images for JSON, or the error."""
     import resource
 
@@ -149,6 +153,7 @@ def _read_here(path: Path, memory: int) -> dict[str, Any]:
 
     with suppress(ValueError):  # of systems without such a limit
         resource.setrlimit(resource.RLIMIT_AS, (memory, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
     suffix = next(each for each in (".bin", ".txt") if _stored(path, each))
     with tempfile.TemporaryDirectory() as folder:
         copy, again = Path(folder) / "copy", Path(folder) / "again"
@@ -190,7 +195,7 @@ FORMAT = ColmapModel()
 
 if __name__ == "__main__":
     try:
-        found = _read_here(Path(sys.argv[1]), int(sys.argv[2]))
+        found = _read_here(Path(sys.argv[1]), *map(int, sys.argv[2:]))
     except Exception as error:
         found = {"error": str(error).split("Check failed: ")[-1][:100]}
     print(json.dumps(found))  # noqa: T201 - the answer to the process that asked

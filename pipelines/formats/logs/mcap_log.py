@@ -7,9 +7,7 @@ without an index ignores checksums and size limits. So this module walks the fil
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 from mcap import records
@@ -23,10 +21,8 @@ from pipelines.formats.logs.recordings import (
     Chunk,
     ChunkedPart,
     Content,
-    OpenLog,
-    begins_like,
 )
-from pipelines.formats.logs.trajectories import open_recording
+from pipelines.formats.logs.trajectories import LogFile
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 
@@ -44,29 +40,11 @@ _RUN = 1 << 20
 _STAMP_LIMIT = 1 << 63
 
 
-class McapLog:
-    """Reader of MCAP files with messages in ros1, cdr, json or protobuf; checksums of chunks are verified."""
-
-    name = "mcap"
-    title = "MCAP log"
-    suffixes: tuple[str, ...] = (".mcap",)
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if the file begins with MCAP's magic bytes, or is empty and named `.mcap`."""
-        return begins_like(path, _MAGIC, self.suffixes)
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe messages, times, storage, topics, and losses."""
-        with self.open_log([path]) as log:
-            return log.describe()
-
-    def open_log(self, paths: Sequence[Path]) -> OpenLog:
-        """Open one file, or the parts of a split one."""
-        return open_recording(paths, McapPart)
-
-
 class McapPart(ChunkedPart):
-    """MCAP file. Messages outside chunks are handled as uncompressed chunks."""
+    """MCAP file with messages in ros1, cdr, json or protobuf; checksums of chunks are verified.
+
+    Messages outside chunks are handled as uncompressed chunks.
+    """
 
     def walk(self) -> tuple[int, bool]:
         """Walk the records up to the end of the file or to the first incomplete one."""
@@ -191,4 +169,4 @@ def _message_row(content: memoryview | bytes, position: int) -> tuple[int, int, 
     return channel, stamp, position
 
 
-FORMAT = McapLog()
+FORMAT = LogFile("mcap", "MCAP log", (".mcap",), _MAGIC, McapPart)

@@ -6,14 +6,12 @@ So this module walks the records itself.
 
 import re
 import struct
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
-from pipelines.formats.logs.recordings import Channel, Chunk, ChunkedPart, Content, OpenLog, begins_like
-from pipelines.formats.logs.trajectories import open_recording
+from pipelines.formats.logs.recordings import Channel, Chunk, ChunkedPart, Content
+from pipelines.formats.logs.trajectories import LogFile
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
 
@@ -30,28 +28,9 @@ _INDEX_ROW = np.dtype([("s", "<u4"), ("ns", "<u4"), ("place", "<u4")])
 Fields = dict[bytes, bytes]
 
 
-class Ros1Bag:
-    """Reader of ROS 1 bags; chunks uncompressed, bz2 or lz4."""
-
-    name = "ros1"
-    title = "ROS 1 bag"
-    suffixes: tuple[str, ...] = (".bag",)
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if the file begins with a bag's first line, or is empty and named `.bag`."""
-        return begins_like(path, _BEGINNING, self.suffixes)
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe messages, times, storage, topics, and losses."""
-        with self.open_log([path]) as log:
-            return log.describe()
-
-    def open_log(self, paths: Sequence[Path]) -> OpenLog:
-        """Open one bag, or several as one recording."""
-        return open_recording(paths, _Bag)
-
-
 class _Bag(ChunkedPart):
+    """ROS 1 bag; chunks uncompressed, bz2 or lz4."""
+
     def walk(self) -> tuple[int, bool]:
         """Walk the records up to the end of the file or to the first incomplete one."""
         position, chunks_stated = self._bag_header()
@@ -185,4 +164,4 @@ def _connection(fields: Fields, data: bytes) -> tuple[int, Channel]:
     return _U32.unpack(fields[b"conn"])[0], Channel(fields[b"topic"].decode(), schema)
 
 
-FORMAT = Ros1Bag()
+FORMAT = LogFile("ros1", "ROS 1 bag", (".bag",), _BEGINNING, _Bag)

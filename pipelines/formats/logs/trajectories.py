@@ -24,7 +24,7 @@ from pipelines.formats.logs.messages import (
     kind_of,
     samples,
 )
-from pipelines.formats.logs.recordings import LogPart, OpenLog, open_parts
+from pipelines.formats.logs.recordings import LogPart, OpenLog, begins_like, open_parts
 from pipelines.formats.poses import clean_poses
 from pipelines.geometry.arrays import Int64
 from pipelines.geometry.clocks import (
@@ -410,6 +410,30 @@ def open_recording(paths: Sequence[Path], open_part: Callable[[Path], LogPart]) 
         for gap in find_gaps(part.received_ns[densest]):
             _take_out_gap(log, part, densest, gap)
     return log
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """Reader of logs in files of one kind: `magic` are their first bytes, `open_part` opens one of them."""
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    magic: bytes
+    open_part: Callable[[Path], LogPart]
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the file begins with the magic bytes, or is empty and named like such a file."""
+        return begins_like(path, self.magic, self.suffixes)
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe messages, times, storage, topics, and losses."""
+        with self.open_log([path]) as log:
+            return log.describe()
+
+    def open_log(self, paths: Sequence[Path]) -> OpenLog:
+        """Open one file, or the parts of a split one."""
+        return open_recording(paths, self.open_part)
 
 
 def _take_out_gap(log: OpenLog, part: LogPart, densest: Int64, gap: StampGap) -> None:

@@ -7,7 +7,7 @@ storage (STO).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -258,44 +258,51 @@ LEAST_JOINTS_OF_WIDE = 4
 _FRAME_NAMES = ("sync_index", "frame")
 
 
-class JointsCsvFormat:
-    """Reader of the header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
+@dataclass(frozen=True)
+class JointFile:
+    """Reader of joints in text: `is_known` recognises its beginning, `read` takes path, unit and axes."""
 
-    Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope);
-    without a time their frames are counted.
-    Metres and z up unless the user states otherwise. Rows of single joints may come in any order; people are
-    ranked by their number. A position that is blank, infinite or absent is missing (NaN).
-    """
-
-    name = "joints_csv"
-    title = "3D joints as CSV"
-    suffixes: tuple[str, ...] = (".csv", ".txt")
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    is_known: Callable[[str], bool]
+    read: Callable[[Path, str | None, str | None], JointMotion]
 
     def recognises(self, path: Path) -> bool:
-        """Return True if the header names a time, a joint and x y z."""
-        head = read_head(path, self.suffixes)
-        return _find_heading(head) is not None or len(_joints_of_wide(head)) >= LEAST_JOINTS_OF_WIDE
+        """Return True if the file begins as such files do."""
+        return self.is_known(read_head(path, self.suffixes))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Describe joints, people, times, missing values, and the box as if in metres with z up."""
-        return describe_motion(self.read_joints(path, unit=None, axes=None))
+        """Describe joints, people, times, missing values, and the box in the world (z up)."""
+        return describe_motion(self.read(path, None, None))
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
         """Read every joint."""
-        text = read_text(path)
-        heading = _find_heading(text)
-        if heading is None and (columns := _joints_of_wide(text)):
-            return _read_wide(path, text, columns, unit or "m", axes or "z-up")
-        if heading is None:
-            problem = "has no header that names the time, joint and x y z"
-            raise DataError(path, problem, "begin with t_ns,joint,x,y,z", code="missing-column")
-        names = heading.names
-        words = {name: column for name, column in names.items() if name in ("joint", "person")}
-        table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})
-        stamps = _stamps(path, heading, table)
-        position = to_metres_z_up(path, table.stack(("x", "y", "z")), unit or "m", axes or "z-up")
-        people = _people(path, table.text.get("person"), len(stamps))
-        return _dense(path, stamps, people, table.text["joint"], position)
+        return self.read(path, unit, axes)
+
+
+def _read_csv(path: Path, unit: str | None, axes: str | None) -> JointMotion:
+    """Read the header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
+
+    Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope);
+    without a time their frames are counted. Metres and z up unless the user states otherwise. Rows of single
+    joints may come in any order; people are ranked by their number. A position that is blank, infinite or
+    absent is missing (NaN).
+    """
+    text = read_text(path)
+    heading = _find_heading(text)
+    if heading is None and (columns := _joints_of_wide(text)):
+        return _read_wide(path, text, columns, unit or "m", axes or "z-up")
+    if heading is None:
+        problem = "has no header that names the time, joint and x y z"
+        raise DataError(path, problem, "begin with t_ns,joint,x,y,z", code="missing-column")
+    names = heading.names
+    words = {name: column for name, column in names.items() if name in ("joint", "person")}
+    table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})
+    stamps = _stamps(path, heading, table)
+    position = to_metres_z_up(path, table.stack(("x", "y", "z")), unit or "m", axes or "z-up")
+    people = _people(path, table.text.get("person"), len(stamps))
+    return _dense(path, stamps, people, table.text["joint"], position)
 
 
 def _stamps(path: Path, heading: Heading, table: TextTable) -> Int64:
@@ -509,6 +516,12 @@ def write_sto(path: Path, t_ns: Int64, value_deg: Float, sigma_deg: Float) -> st
     return ", ".join(f"{count} {what}" for what, count in lost.items() if count)
 
 
-JOINTS_CSV = JointsCsvFormat()
+JOINTS_CSV = JointFile(
+    "joints_csv",
+    "3D joints as CSV",
+    (".csv", ".txt"),
+    lambda head: _find_heading(head) is not None or len(_joints_of_wide(head)) >= LEAST_JOINTS_OF_WIDE,
+    _read_csv,
+)
 CSV_EXPORT = CsvExport()
 ANGLES_EXPORT = AnglesExport()

@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import people_of
-from pipelines.formats.common.files import read_head
 from pipelines.formats.common.refusals import bad_value, damaged, empty
 from pipelines.formats.common.rows import format_seconds, median_step_ns, parse_stamps
 from pipelines.formats.skeletons.joint_files import (
     METRES,
-    describe_motion,
+    JointFile,
     joint_names,
     marker_name,
     metric_unit,
@@ -45,42 +44,21 @@ class _TrcHeader:
     markers: tuple[str, ...]
 
 
-class TrcFormat:
-    """Reader of one person. Pose2Sim's markers get our joint names (RHip is right_hip), others keep theirs.
+def _read(path: Path, unit: str | None, axes: str | None) -> JointMotion:
+    """Read every row of one person; blank cells and NaN are missing.
 
-    A `unit` stated by the user overrides the header's Units, because files in mm often claim m.
-    `axes` is y-up unless stated: world = (z, x, y) of the file.
+    Pose2Sim's markers get our joint names (RHip is right_hip), others keep theirs. A `unit` stated by the
+    user overrides the header's Units, because files in mm often claim m. `axes` is y-up unless stated:
+    world = (z, x, y) of the file.
     """
-
-    name = "trc"
-    title = "OpenSim markers (TRC)"
-    suffixes: tuple[str, ...] = (".trc",)
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if the file begins like every TRC."""
-        return read_head(path, self.suffixes).startswith("PathFileType")
-
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe header, joints, times, missing values, and the box in the world (z up)."""
-        header, _, _ = _split(path, read_text(path))
-        stated = {key: header.keys[key] for key in ("Units", "DataRate", "NumFrames") if key in header.keys}
-        return {
-            **{f"header: {key}": value for key, value in stated.items()},
-            **describe_motion(self.read_joints(path, unit=None, axes=None)),
-        }
-
-    def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read every row; blank cells and NaN are missing."""
-        header, rows, first_line = _split(path, read_text(path))
-        if unit is None:
-            unit = metric_unit(header.keys.get("Units", ""))
-        times, values = _numbers(path, rows, len(header.markers), first_line)
-        t_ns, readable = parse_stamps(path, times)
-        if not readable.all() or (np.diff(t_ns) <= 0).any():
-            bad = np.flatnonzero(~readable | (np.diff(t_ns, prepend=t_ns[0] - 1) <= 0))
-            raise damaged(path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase")
-        position = to_metres_z_up(path, values, unit, axes or "y-up")
-        return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
+    header, rows, first_line = _split(path, read_text(path))
+    times, values = _numbers(path, rows, len(header.markers), first_line)
+    t_ns, readable = parse_stamps(path, times)
+    if not readable.all() or (np.diff(t_ns) <= 0).any():
+        bad = np.flatnonzero(~readable | (np.diff(t_ns, prepend=t_ns[0] - 1) <= 0))
+        raise damaged(path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase")
+    position = to_metres_z_up(path, values, unit or metric_unit(header.keys.get("Units", "")), axes or "y-up")
+    return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
 
 
 def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
@@ -182,5 +160,7 @@ def write_joints(
                 file.write("\t".join([str(frame), stamp, *cells]) + "\n")
 
 
-FORMAT = TrcFormat()
+FORMAT = JointFile(
+    "trc", "OpenSim markers (TRC)", (".trc",), lambda head: head.startswith("PathFileType"), _read
+)
 EXPORT = TrcExport()
