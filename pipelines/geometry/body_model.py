@@ -231,8 +231,9 @@ def _longer(part: str, vertices: Float, joint: Float, weights: Float) -> Float:
         if parent is not None:
             above = BONE[parent]
             moved[BONE[name]] = moved[above] + stretch[above] @ (joint[BONE[name]] - joint[above])
-    away = vertices[:, None] - joint
-    change = np.einsum("vb,vbi->vi", weights, moved + np.einsum("bij,vbj->vbi", stretch, away))
+    # Of each bone moved + stretch (v - joint), weighted.
+    fixed = weights @ (moved - (stretch @ joint[..., None])[..., 0])
+    change = fixed + ((weights @ stretch.reshape(-1, 9)).reshape(-1, 3, 3) @ vertices[..., None])[..., 0]
     step = 1e-3
     grown = height_standing(vertices + step * change, joint + step * moved)
     # Heights are from the pelvis here, and the foot's own height stays.

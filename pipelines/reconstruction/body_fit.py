@@ -55,6 +55,10 @@ _BOUND_RAD = np.radians(5.0)
 _USUAL_SHARE = 0.5
 # A relaxed arm bends its elbow by so much, degrees.
 _USUAL_ELBOW_DEG = -20.0
+# No landmark is surer than this, whatever a covariance says.
+_LEAST_SIGMA_M = 1e-3
+# A trunk that is shorter or narrower than this has no directions.
+_LEAST_TRUNK_M = 0.02
 # A longer step leaves the range of the linear model.
 _LONGEST_STEP_RAD = 0.5
 
@@ -204,7 +208,11 @@ def fit_body(
     """
     known = np.asarray(np.isfinite(place).all(axis=-1))
     trunk = [landmarks.joints.index(name) for name in _TRUNK]
-    (row,) = np.nonzero(known[:, trunk].all(axis=1) & (known.sum(axis=1) >= MIN_LANDMARKS))
+    left_hip, right_hip, left_shoulder, right_shoulder = (place[:, k] for k in trunk)
+    sides = left_hip - right_hip, left_shoulder - right_shoulder, left_shoulder - left_hip
+    whole = known[:, trunk].all(axis=1) & (known.sum(axis=1) >= MIN_LANDMARKS)
+    whole &= np.min([np.linalg.norm(side, axis=1) for side in sides], axis=0) > _LEAST_TRUNK_M
+    (row,) = np.nonzero(whole)
     if not len(row):
         return None
     model = body_model()
@@ -239,7 +247,8 @@ def fit_body(
 def _seen(place: Float, covariance: Float) -> _Seen:
     """Invert the covariances of landmarks [N, K, 3]; a landmark without a place has no weight."""
     known = np.asarray(np.isfinite(place).all(axis=-1, keepdims=True))
-    inverse = np.linalg.inv(np.where(known[..., None], covariance, np.eye(3)))
+    sure = np.where(known[..., None], covariance, np.eye(3)) + _LEAST_SIGMA_M**2 * np.eye(3)
+    inverse = np.linalg.inv(sure)
     root = np.swapaxes(np.linalg.cholesky(inverse), -1, -2) * known[..., None]
     return _Seen(np.where(known, place, 0.0), root)
 
