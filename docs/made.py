@@ -299,7 +299,7 @@ def figures() -> str:
         f"`mocap check` names the mistake in {named['named first']} of {named['mistakes that count']}"
         " flights that are described with one (modelled, three drones, kept aside; an earlier version).\n"
         f"In {flights} replays of planners in random worlds {touched or 'no'} drone touches anything"
-        " (simulated; an earlier version)."
+        " (simulated)."
     )
     header = ("mean error of a joint", "`mocap reconstruct`", "triangulation alone")
     return f"{table(header, rows)}\n{said}\n"
