@@ -47,7 +47,7 @@ CODES = {
     "nothing-reconstructed": "no joint could be reconstructed",
     "out-of-memory": "the memory does not suffice",
     "outside-folder": "a relative path leads out of its folder",
-    "place-unknown": "a place on Earth cannot be brought into the world",
+    "place-unknown": "a place on Earth is not known, or cannot be brought into the world",
     "special-file": "a pipe, a socket or a device",
     "stated-twice": "one thing is stated more than once",
     "store-refused": "an object store refuses the credentials",
