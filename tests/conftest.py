@@ -30,8 +30,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 _HERE = Path(__file__).parent
 
 # Test files that compile most code, slowest first. Two workers that begin with these compile little code
-# twice, and the other files find it in the cache.
-_COMPILING = (
+# twice, and the other files find it in the cache. The last is the longest file of all: begun late, it would
+# keep one worker busy alone.
+_FIRST = (
     "reconstruction/test_refinement.py",
     "keypoints/test_association.py",
     "planning/test_costs.py",
@@ -39,12 +40,13 @@ _COMPILING = (
     "simulation/rendering/test_renderer.py",
     "planning/test_search.py",
     "simulation/test_flying.py",
+    "reconstruction/test_doubts.py",
 )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort files that compile first, then those with slow tests, so that workers end at the same time."""
-    first = {_HERE / name: place for place, name in enumerate(_COMPILING)}
+    """Sort those of `_FIRST` first, then those with slow tests, so that workers end at the same time."""
+    first = {_HERE / name: place for place, name in enumerate(_FIRST)}
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: (first.get(item.path, len(first)), item.path not in slow))
 
