@@ -297,7 +297,7 @@ def figures() -> str:
     ]
     said = (
         f"`mocap check` names the mistake in {named['named first']} of {named['mistakes that count']}"
-        " flights that are described with one (modelled, three drones, kept aside; an earlier version).\n"
+        " flights that are described with one (modelled, three drones, kept aside).\n"
         f"In {flights} replays of planners in random worlds {touched or 'no'} drone touches anything"
         " (simulated)."
     )
