@@ -470,7 +470,10 @@ class AnglesExport:
         table = recording.angles()
         if table is None or not len(table) or table["value_deg"].isna().all():
             raise DataError(
-                recording.name, "holds no joint angles to export", "run `mocap reconstruct` first"
+                recording.name,
+                "holds no joint angles to export",
+                "run `mocap reconstruct` first",
+                code="nothing-reconstructed",
             )
         name = safe_file_name(recording.name)
         paths = [folder / f"{name}_angles.csv"]
