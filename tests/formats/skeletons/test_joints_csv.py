@@ -14,7 +14,7 @@ from pipelines.formats.skeletons import joint_files
 from pipelines.session.errors import DataError
 from pipelines.session.recognition import recognise
 from pipelines.session.records import JointMotion, Recording, Trajectory
-from pipelines.session.registries import Export, JointFormat
+from pipelines.session.registries import FORMATS, Export, JointFormat
 from tests.formats.motions import motions
 from tests.raising import refused
 
@@ -36,7 +36,7 @@ def test_rows_in_any_order_become_dense(tmp_path: Path) -> None:
     path = write(
         tmp_path, "t_ns,person,joint,x,y,z\n20,7,nose,1,2,3\n10,3,hip,4,5,6\n10,7,nose,7,8,9\n20,3,nose,,,\n"
     )
-    assert READER.recognises(path)
+    assert [each.name for each in FORMATS.all() if each.recognises(path)] == ["joints_csv"]
     motion = read(path)
     assert motion.t_ns.tolist() == [10, 20]
     assert motion.joints == ("nose", "hip")
