@@ -334,8 +334,11 @@ class _ManifestWriter:
 
     def _fixed_mount(self, camera: CameraDraft) -> DraftedKey:
         remark = self.assume(camera, "mount", "the camera looks forward, level, from the body's origin")
+        by_film = "# or, in place of the mount: pose: {..., attitude: pictures}"
         return DraftedKey(
-            self.guessed({"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}), [remark]
+            self.guessed({"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}),
+            [remark],
+            [by_film] if camera.film else [],
         )
 
     def _intrinsics(self, camera: CameraDraft) -> DraftedKey:

@@ -49,6 +49,8 @@ LONGER_SIDE_PX = 800
 MAX_FEATURES = 1000
 # Key pictures are matched with those this many steps later; the far ones have the parallax.
 PAIR_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+# Of so few key pictures all pairs are matched: a survey's legs overlap, and it takes seconds.
+MAX_PICTURES_FOR_ALL_PAIRS = 30
 # Lowe (2004): nearest neighbours at more than 0.8 of the second distance are mostly wrong.
 MAX_RATIO = 0.8
 # Descriptors of one point seen twice are closer (COLMAP's default).
@@ -73,6 +75,12 @@ OTHER_FOCAL = 1.1
 MAX_FOCAL_DISAGREEMENT = 0.02
 # Attitudes with a larger common error start the estimate outside of its convergence (20 deg: 1 of 2 failed).
 MAX_ATTITUDE_SIGMA_DEG = 10.0
+# Residuals of a right map are those of the places: beyond three times their stated errors (a mean square of
+# 9) the map is wrong. Rendered flights with blurred pictures gave such maps, with attitudes off by 10 to 80
+# deg.
+MAX_MISFIT = 9.0
+# Where nobody states the places' errors, a map that misses them by more of its size is taken for a wrong one.
+MAX_UNSTATED_SHARE = 0.03
 # Gimbals hold their horizon to this, and so does the mean of a camera on a drone that banks both ways.
 LEVEL_SIGMA_DEG = 2.0
 # The least squares converge from half of this.
@@ -269,9 +277,10 @@ def _write_features(
         database.write_keypoints(image.image_id, pixels.astype(np.float32))
         ids.append(image.image_id)
     units = [_unit(found.descriptors) for found in features]
-    matched = 0
-    for first in range(len(features)):
-        for second in (first + step for step in PAIR_STEPS if first + step < len(features)):
+    matched, count = 0, len(features)
+    steps = PAIR_STEPS if count > MAX_PICTURES_FOR_ALL_PAIRS else range(1, count)
+    for first in range(count):
+        for second in (first + step for step in steps if first + step < count):
             matches = match_features(units[first], units[second])
             if len(matches) >= MIN_MATCHES:
                 database.write_matches(ids[first], ids[second], matches)
@@ -349,14 +358,23 @@ def lay_on_places(
     logged = places[rows]
     start, fits = _first_similarity(mapped, logged)
     mapped, logged, seconds = mapped[fits], logged[fits], seconds[fits]
+    unstated = errors is None
     if errors is None:
         level = max(float(np.sqrt(np.square(start.places(mapped) - logged).mean())), 1e-3)
         errors = PoseErrors((level, 0.0), ())
     factor = cholesky(position_covariance(errors, seconds), lower=True)
     start = _upright(start, mapped, logged, factor, found.quaternion_xyzw)
-    fit, spread = _fitted(start, mapped, logged, factor, found.quaternion_xyzw)
+    fit, spread, misfit = _fitted(start, mapped, logged, factor, found.quaternion_xyzw)
     residual_m = float(np.sqrt(np.square(fit.places(mapped) - logged).sum(axis=1).mean()))
     largest_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(spread)[-1])))
+    share = residual_m / (fit.scale * found.size)
+    if misfit > MAX_MISFIT or (unstated and share > MAX_UNSTATED_SHARE):
+        stated = "" if unstated else f" ({np.sqrt(misfit):.1f} times the errors of pose_noise)"
+        raise NoAttitudesError(
+            f"its map misses its places by {residual_m:.2g} m{stated}, {100 * share:.0f} % of its size: the"
+            " map is wrong (blurred pictures, little texture, another clock), or state larger errors of the"
+            " places in pose_noise"
+        )
     if largest_deg > MAX_ATTITUDE_SIGMA_DEG:
         length_m = fit.scale * found.size
         raise NoAttitudesError(
@@ -443,13 +461,13 @@ def position_covariance(errors: PoseErrors, seconds: Float) -> Float:
 
 def _fitted(
     start: _Similarity, mapped: Float, logged: Float, factor: Float, quaternion_xyzw: Float
-) -> tuple[_Similarity, Float]:
+) -> tuple[_Similarity, Float, float]:
     """Refine a similarity by generalised least squares with a level horizon.
 
     `factor` is the lower Cholesky factor of the places' covariance along each axis [N, N].
 
-    Returns the similarity with the covariance [3, 3] of its rotation about the world's axes, rad^2. If the
-    residuals are larger than the places' errors explain, the covariance grows with them.
+    Returns the similarity, the covariance [3, 3] of its rotation about the world's axes, rad^2, and the mean
+    square of the residuals in standard deviations, with which the covariance grows.
     """
     from scipy.linalg import solve_triangular
 
@@ -482,7 +500,7 @@ def _fitted(
             break
     misfit = float(np.square(white[:, 7]).sum()) / max(len(white) - 7, 1)
     spread = np.linalg.inv(information)[4:, 4:] * max(misfit, 1.0)
-    return fit, spread
+    return fit, spread, misfit
 
 
 def _cross(vectors: Float) -> Float:

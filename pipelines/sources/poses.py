@@ -93,7 +93,10 @@ ADD_ANGLES = (
     " gimbal: {file, topic, relative_to: world} with the angles of another log, or"
     " gimbal: {yaw_deg: 90, pitch_deg: -30} if the camera never turned"
 )
-_ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, or add a gimbal"
+_ADD_MOUNT = (
+    "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, add a gimbal, or add"
+    " attitude: pictures to pose if you do not know"
+)
 
 
 Track = TypeVar("Track", PositionTrack, AttitudeTrack)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,16 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.formats.poses import TUM
+from pipelines.formats.poses import TUM, write_tum
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rotation_vector_from_quaternion
+from pipelines.geometry.poses import (
+    conjugate,
+    interpolate_poses,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+)
 from pipelines.session.storage import read_json
 from pipelines.session.tables import POSES, read_table, trajectory_from
 from pipelines.session.yaml_files import plain_yaml
@@ -106,6 +113,15 @@ def test_pictures_say_how_a_camera_turned(tmp_path: Path) -> None:
     kept = (session / "cameras" / "drone1" / "picture_map.parquet").read_bytes()
     camera["pose_noise"]["white"]["position_m"] = 0.02
     assert (ingested() / "cameras" / "drone1" / "picture_map.parquet").read_bytes() == kept
+    # A log whose attitudes are wrong by 20 deg serves as well: its places alone are used.
+    true = TUM.read_trajectory(folder / "truth" / "drone1.tum")
+    wrong = quaternion_from_rotation_vector(np.radians([20.0, 0.0, 0.0]))
+    write_tum(folder / "wrong.tum", replace(true, quaternion_xyzw=multiply(true.quaternion_xyzw, wrong)))
+    places, camera["pose"] = camera["pose"], {"file": "wrong.tum", "attitude": "pictures"}
+    off = attitude_errors_deg(ingested(), folder, "drone1")
+    assert np.sqrt(np.square(off).mean()) < 0.3
+    camera["pose"] = places
+
     # Mapped anew, it is the same.
     assert (ingested("--force") / "cameras" / "drone1" / "picture_map.parquet").read_bytes() == kept
 
