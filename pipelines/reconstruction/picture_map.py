@@ -22,7 +22,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Index, Int64, Intrinsics, Picture
 from pipelines.geometry.cameras import undistort
-from pipelines.geometry.noise import ROTATION, PoseErrors
+from pipelines.geometry.noise import ROTATION, PoseErrors, Process
 from pipelines.geometry.poses import (
     continuous_signs,
     interpolate_points,
@@ -79,6 +79,9 @@ MAX_ATTITUDE_SIGMA_DEG = 10.0
 # 9) the map is wrong. Rendered flights with blurred pictures gave such maps, with attitudes off by 10 to 80
 # deg.
 MAX_MISFIT = 9.0
+# Above this mean square the map is bent, slowly: over a quarter of the film. Far fewer numbers then speak of
+# the rotation; taken for white, such residuals gave attitudes off by three to four standard deviations.
+BENT_MISFIT = 2.0
 # Where nobody states the places' errors, a map that misses them by more of its size is taken for a wrong one.
 MAX_UNSTATED_SHARE = 0.03
 # Gimbals hold their horizon to this, and so does the mean of a camera on a drone that banks both ways.
@@ -365,6 +368,13 @@ def lay_on_places(
     factor = cholesky(position_covariance(errors, seconds), lower=True)
     start = _upright(start, mapped, logged, factor, found.quaternion_xyzw)
     fit, spread, misfit = _fitted(start, mapped, logged, factor, found.quaternion_xyzw)
+    if BENT_MISFIT < misfit <= MAX_MISFIT:  # what the places do not explain is a bend of the map, and slow
+        bend = PoseErrors((0.0, 0.0), (Process(0, 1.0, correlation_s=float(np.ptp(seconds)) / 4),))
+        apart = fit.places(mapped) - logged
+        covariance = position_covariance(errors, seconds)
+        excess = max(float(np.square(apart).mean() - np.diagonal(covariance).mean()), 0.0)
+        factor = cholesky(covariance + excess * position_covariance(bend, seconds), lower=True)
+        fit, spread, _ = _fitted(fit, mapped, logged, factor, found.quaternion_xyzw)
     residual_m = float(np.sqrt(np.square(fit.places(mapped) - logged).sum(axis=1).mean()))
     largest_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(spread)[-1])))
     share = residual_m / (fit.scale * found.size)
