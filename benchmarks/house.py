@@ -335,7 +335,7 @@ def rows_of(options: argparse.Namespace) -> Iterator[Row]:
 
     lines = sum(module.lines for module in benchmarks)
     yield Row("benchmarks, lines", lines, 4_000, "", largest(benchmarks))
-    commands = tuple(m.place for m in benchmarks if "__main__" in m.text)
+    commands = tuple(m.place for m in benchmarks if "if __name__ ==" in m.text)
     yield Row("benchmarks, commands", len(commands), 8, "", commands)
     importing = [
         m.place for m in tests if re.search(r"^\s*(from|import) benchmarks", m.text, flags=re.MULTILINE)

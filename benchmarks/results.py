@@ -180,14 +180,14 @@ def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
         ),
     ]
     for section in SECTIONS:
-        lines += [f"## {section.title}", "", *_words(section.words)]
-        for part in section.parts:
-            if part.key in stored:
-                one = stored[part.key]
-                kind = ", ".join(filter(None, (part.kind, part.halves)))
-                lines += [f"**{part.title}** ({kind}; {one['date']}, {one['commit']})", ""]
-                lines += [f"    {command}" for command in one["command"].splitlines()]
-                lines += ["", *one["lines"], ""]
+        measured = [part for part in section.parts if part.key in stored]
+        lines += [f"## {section.title}", "", *_words(section.words)] if measured else []
+        for part in measured:
+            one = stored[part.key]
+            kind = ", ".join(filter(None, (part.kind, part.halves)))
+            lines += [f"**{part.title}** ({kind}; {one['date']}, {one['commit']})", ""]
+            lines += [f"    {command}" for command in one["command"].splitlines()]
+            lines += ["", *one["lines"], ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
