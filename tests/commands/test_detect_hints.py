@@ -58,17 +58,13 @@ class Flight:
         entry, between = description.cameras["left"], description.pose_interpolation
         return actor_hints(actor, "left", entry, track, between, stamps)
 
-    def detected(self, detector: str, start_s: float | None = None) -> StageRecord:
+    def detected(self, detector: str) -> StageRecord:
         """The record of the stage, which is run where it has to be."""
         self.ingest()
         with locked(self.session) as writable:
-            record = detect(writable, detector=detector, start_s=start_s)
+            record = detect(writable, detector=detector)
         assert record is not None
         return record
-
-    def key(self, detector: str, start_s: float | None = None) -> str:
-        """The key of the stage, which is run where that is not there yet."""
-        return self.detected(detector, start_s).key
 
 
 @pytest.mark.parametrize(("point", "height_m"), [("hip", 1.0), ("feet", 0.05), ("head", 1.7)])
@@ -140,20 +136,3 @@ def test_only_another_log_of_the_actor_has_the_keypoints_detected_anew(tmp_path:
     feet = flight.detected(detector)
     found_with = [record.inputs["hints_from"] for record in (hinted, higher, feet)]
     assert len(set(found_with)) == 3
-
-
-def test_a_span_counts_from_the_first_frame_of_cameras_with_keypoints_too(tmp_path: Path) -> None:
-    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
-    right = flight.settings["cameras"]["right"]
-    keypoints = np.column_stack([np.full((17, 2), 100.0), np.ones(17)]).ravel().tolist()
-    seen = [
-        {"image_id": f"{k}.jpg", "category_id": 1, "keypoints": keypoints, "score": 1} for k in range(FRAMES)
-    ]
-    (tmp_path / "right.json").write_text(str(seen).replace("'", '"'), encoding="utf-8")
-    right["keypoints"] = {"file": "right.json", "format": "alphapose", "skeleton": "coco17"}
-    spanned, whole = flight.key(detector, start_s=0.5 / FPS), flight.key(detector)
-    # Its clock moves, and with it the moment from which the span is counted.
-    right["clock"]["offset_s"] = -0.5 / FPS
-
-    assert flight.key(detector) == whole
-    assert flight.key(detector, start_s=0.5 / FPS) != spanned

@@ -310,17 +310,6 @@ def test_a_real_recording_of_four_cameras_needs_nothing_more(tmp_path: Path) -> 
     assert [camera.frames.count for camera in done.description.cameras.values()] == [100] * 4
 
 
-def test_real_keypoints_without_videos_are_drafted_with_a_rate_to_check(tmp_path: Path) -> None:
-    recording = real_data("pose2sim_single")
-    result = draft([recording / "pose-associated", recording / "calibration"], tmp_path / "flight.yaml")
-    assert not result.missing
-    [remark] = result.assumed
-    assert remark.startswith("cam01, cam02, cam03, cam04: frame_times: fps 30, ")
-    edit(result.path, {"fps: 30": "fps: 60"})
-    done = ingest(result.path)
-    assert [c.frames.rate_hz for c in done.description.cameras.values()] == [pytest.approx(60)] * 4
-
-
 def test_an_example_flight_needs_no_files_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     written = result_of("init", "--example", "mound_walk")

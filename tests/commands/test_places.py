@@ -18,7 +18,7 @@ from pipelines.session.maps import read_grid, write_grid
 from pipelines.session.records import Occupancy, Trajectory
 from pipelines.sources.world import Projection
 from tests.commands.runner import refused
-from tests.commands.test_drone_flights import errors, session_of
+from tests.commands.test_drone_flights import errors
 from tests.formats.maps.test_las import write as write_las
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import HOME
@@ -60,7 +60,7 @@ def grid_north_rad() -> float:
     return -float(np.arctan2(north[0] - south[0], north[1] - south[1]))
 
 
-def flown_in_utm(folder: Path, *, origin: bool = True) -> SyntheticFlight:
+def flown_in_utm(folder: Path) -> SyntheticFlight:
     """Write a flight whose poses are in UTM: grid axes for positions and attitudes."""
     flight = write_flight(folder, cameras=2, seconds=1.0, clean=True)
     turn = quaternion_from_rotation_vector(np.array([0, 0, grid_north_rad()]))
@@ -71,9 +71,8 @@ def flown_in_utm(folder: Path, *, origin: bool = True) -> SyntheticFlight:
         )
         flight.settings["cameras"][name]["pose"] = {"file": f"{name}.tum"}
     flight.settings["world"] |= {"crs": ZONE}
-    if origin:
-        names = ("latitude_deg", "longitude_deg", "altitude_m")
-        flight.settings["world"]["origin"] = {name: getattr(HOME, name) for name in names}
+    names = ("latitude_deg", "longitude_deg", "altitude_m")
+    flight.settings["world"]["origin"] = {name: getattr(HOME, name) for name in names}
     flight.settings.pop("truth", None)
     flight.save()
     return flight
@@ -88,16 +87,6 @@ def test_poses_in_utm_are_where_and_as_they_were_flown(tmp_path: Path) -> None:
         off_m, off_deg = errors(flight, k)
         assert off_m < 1e-3  # the series is exact to 0.1 mm
         assert off_deg < 1e-3  # meridians converge by 1e-4 deg over the flight
-
-
-def test_without_an_origin_the_first_pose_is_it(tmp_path: Path) -> None:
-    flight = flown_in_utm(tmp_path, origin=False)
-    ingest(flight.manifest)
-    origin = session_of(flight)["origin"]
-    first = place_at(flight.camera_position[0][0], HOME)
-    assert origin["source"] == "drone1.tum"
-    assert origin["latitude_deg"] == pytest.approx(first.latitude_deg, abs=1e-9)
-    assert origin["longitude_deg"] == pytest.approx(first.longitude_deg, abs=1e-9)
 
 
 def test_a_map_in_utm_stands_where_it_was_measured(tmp_path: Path) -> None:

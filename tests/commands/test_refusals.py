@@ -20,6 +20,7 @@ from pipelines.geometry.cameras import project
 from pipelines.session.description import read_description
 from pipelines.session.registries import FORMATS
 from pipelines.session.stages import COMMANDS
+from pipelines.session.storage import read_json
 from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
@@ -27,11 +28,6 @@ from tests.synthetic.flights import SyntheticFlight, write_flight
 @pytest.fixture
 def flight(tmp_path: Path) -> SyntheticFlight:
     return write_flight(tmp_path, cameras=3, seconds=0.5)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return document
 
 
 def session_json(folder: Path) -> dict[str, Any]:
