@@ -129,7 +129,7 @@ from pipelines.session.tables import (
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=29)
+RECONSTRUCT = Stage("reconstruct", revision=30)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 # Detectors place joints in sharp pictures of this size to about three pixels.

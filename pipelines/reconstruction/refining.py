@@ -131,6 +131,11 @@ class RobustFlight:
         return limbs if limbs.sum() >= _FEWEST_LIMBS else np.ones_like(limbs)
 
     @property
+    def start(self) -> Float:
+        """Points [T, P, J, 3] m of `robust`."""
+        return self.result.points.reshape(*self.observations.confidence.shape[:3], 3)
+
+    @property
     def t_s(self) -> Float:
         """Seconds [T] since the skeleton's first time."""
         seconds: Float = (self.observations.t_ns - self.observations.t_ns[0]) / 1e9
@@ -305,26 +310,26 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
     estimated offsets, and the refinement is repeated until the remaining correction is small, or smaller than
     its standard deviation. The clocks of a long flight are found in some of its windows.
     """
-    started = _triangulate_with_offsets(flight, offset_s) if offset_s.any() else flight.result
+    started = _start_with_offsets(flight, offset_s) if offset_s.any() else flight.start
     if len(flight.windows) > 1 and flight.clock_sigma_s.any() and not flight.only_limbs:
         settled, offset_s = _settle_clocks(replace(flight, only_limbs=True), offset_s)
         held = replace(flight, clock_sigma_s=np.zeros_like(offset_s))
-        refined = _refine_with_offsets(held, offset_s, _triangulate_with_offsets(flight, offset_s))
+        refined = _refine_with_offsets(held, offset_s, _start_with_offsets(flight, offset_s))
         return replace(refined, clock_sigma_s=settled.clock_sigma_s), offset_s
     for _ in range(1 + _MOST_SHIFTS):
         refined = _refine_with_offsets(flight, offset_s, started)
         offset_s = offset_s + refined.clock_offset_s
         if not _unsettled(refined).any():
             break
-        started = _triangulate_with_offsets(flight, offset_s)
+        started = _start_with_offsets(flight, offset_s)
     return refined, offset_s
 
 
-def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangulation) -> Refined:
-    """Run the refinement with these clock offsets, starting from these points."""
+def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Float) -> Refined:
+    """Run the refinement with these clock offsets, starting from these points [T, P, J, 3]."""
     _, people, joints, _ = flight.observations.confidence.shape
     cameras = shifted(flight.cameras, offset_s)
-    start = np.where(flight.trusted[:, None, None], started.points.reshape(-1, people, joints, 3), np.nan)
+    start = np.where(flight.trusted[:, None, None], started, np.nan)
     if flight.only_limbs:
         start = np.where(flight.limbs[:, None], start, np.nan)
     sightings = [_sighting(flight, c, camera) for c, camera in enumerate(cameras)]
@@ -344,15 +349,19 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangu
     )
 
 
-def _triangulate_with_offsets(flight: RobustFlight, offset_s: Float) -> Triangulation:
-    """Triangulate the flight by `robust` with these clock offsets."""
-    _, views = _observe_with_offsets(flight, offset_s)
-    views = replace(views, pixel_sigma=estimate_noise(views))
-    return triangulate_pictures(
-        views,
-        picture=pictures_of(flight.observations),
-        pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
-    )
+def _start_with_offsets(flight: RobustFlight, offset_s: Float) -> Float:
+    """Triangulate by `robust` with these clock offsets, window by window: [T, P, J, 3] m, NaN outside."""
+    start = np.full((*flight.observations.confidence.shape[:3], 3), np.nan)
+    for window in flight.windows:
+        own = slice(window.first, window.stop)
+        observed, views = _observe_with_offsets(flight, offset_s, own)
+        found = triangulate_pictures(
+            replace(views, pixel_sigma=estimate_noise(views)),
+            picture=pictures_of(observed),
+            pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
+        )
+        start[own] = found.points.reshape(-1, *start.shape[1:])
+    return start
 
 
 def _undetermined_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:

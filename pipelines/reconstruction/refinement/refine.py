@@ -34,6 +34,7 @@ from pipelines.reconstruction.refinement.estimate import (
 )
 from pipelines.reconstruction.refinement.kernels import State, turned
 from pipelines.reconstruction.refinement.system import (
+    LOOSE_MOTION,
     REMEMBERED,
     Knowledge,
     Pictures,
@@ -55,9 +56,6 @@ _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a wa
 _BONE_SIGMA_M = 0.02
 # Fewer times do not determine accelerations.
 _FEWEST_TIMES = 20
-# A gait repeats, and its accelerations are not random: the tight prior makes swings smaller. With bones of
-# constant length, it biases clock offsets by 7 ms in flights of 4 s. So clocks have this factor.
-LOOSE_MOTION = 3.0
 # Accelerations learned in uncorrected poses are too small for kicks by this factor.
 _FAST_MOTION = 2.0
 SETTLED_S = 2e-3
@@ -266,7 +264,9 @@ def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Fl
     """Estimate each clock's offset and its standard deviation [C] s, 0 for known clocks."""
     if not (known.clock_sigma_s > 0).any():
         return np.zeros(len(known.poses)), np.zeros(len(known.poses))
-    loose = replace(known, acceleration=LOOSE_MOTION**2 * known.acceleration)
+    loose = known
+    if known.memory <= REMEMBERED:
+        loose = replace(known, acceleration=LOOSE_MOTION**2 * known.acceleration)
     system, state, at = solve(problem, loose, state, rounds=_ROUNDS)
     left = np.sqrt(np.diagonal(shared_covariance(system, at)))
     return _of_clocks(system, state.shared), _of_clocks(system, left)
