@@ -46,4 +46,4 @@ def test_a_simulated_person_gets_her_body(tmp_path: Path) -> None:
 
     succeeds("export", session, "--to", "mesh", "-o", tmp_path / "out")
     (path,) = (tmp_path / "out").glob("*.glb")
-    assert len(trimesh.load(path).geometry) == 1
+    assert len(trimesh.load_scene(path).geometry) == 1

@@ -32,7 +32,7 @@ def body_of(t_ns: np.ndarray[Any, Any]) -> MovingBody:
     rotation = quaternion_from_rotation_vector(rng.normal(0, 0.3, (len(t_ns), len(BONES), 3)))
     shares = np.array([1.0, *shape[1:]])
     steps, joint = (shape[0] * np.tensordot(shares, part, 1) for part in (model.steps, model.joint))
-    root = np.stack([np.arange(len(t_ns)), np.zeros(len(t_ns)), np.ones(len(t_ns))], axis=1)
+    root = np.stack([np.arange(len(t_ns), dtype=np.float64), np.zeros(len(t_ns)), np.ones(len(t_ns))], axis=1)
     skinning = Skinning(joint, model.neutral_from_rest, steps)
     matrix, translation = skinning.transforms(root, rotation)
     centre = np.einsum("tbij,bj->tbi", matrix[:, : len(BONES)], joint) + translation[:, : len(BONES)]
@@ -87,7 +87,7 @@ def test_the_skin_of_the_file_is_the_surface_of_the_model(tmp_path: Path) -> Non
     assert away.max() < 0.03  # a vertex of more than four bones keeps the four strongest
     assert away.mean() < 0.0005
 
-    scene = trimesh.load(path)
+    scene = trimesh.load_scene(path)
     (mesh,) = scene.geometry.values()
     assert mesh.faces.shape == (2 * len(body_model().quads), 3)
     np.testing.assert_allclose(np.sort(mesh.extents), np.sort(np.ptp(rest, axis=0)), atol=1e-5)
