@@ -28,13 +28,13 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 
 # A small model takes a second of processor time, nearly all of it to import pycolmap.
-READING_CPU_S = 5
+READING_CPU_S = 3
 # A busy machine gives a process a quarter of its processor.
 READING_TIMEOUT_S = 20.0
 # Slow disks and machines read that much; a larger file gets the time on top.
 _SLOWEST_READING_BYTES_PER_S = 2e6
 # Images need up to ten times their size in the file; damaged counts ask for terabytes.
-_MEMORY_BYTES, _MEMORY_PER_BYTE = 3 << 28, 20
+_MEMORY_BYTES, _MEMORY_PER_BYTE = 1 << 29, 20
 _FILES = ("cameras", "images")
 
 
