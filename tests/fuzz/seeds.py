@@ -22,7 +22,7 @@ from tests.formats.calibrations import (
     test_orbslam,
     test_ros_camera_info,
 )
-from tests.formats.drone_logs import test_dji_records
+from tests.formats.drone_logs import test_dji_records, test_place_tracks
 from tests.formats.exported import flown, recording, walking
 from tests.formats.keypoint_files import test_coco_results, test_mmpose, test_other_programs
 from tests.formats.log_entries import entries
@@ -150,6 +150,7 @@ SEEDS: dict[str, Writer] = {
     "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
     "gopro": lambda folder: video_tracks.write_gopro(folder / "a.mp4", _truth(folder)),
     "gopro without telemetry": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
+    "gpx": _text("a.gpx", test_place_tracks.GPX_TEXT),
     "joints_csv": lambda folder: joint_files.write_joints(folder / "joints.csv", walking(4)),
     "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
     "las": lambda folder: test_las.write(folder / "a.las"),
@@ -179,6 +180,7 @@ SEEDS: dict[str, Writer] = {
     "ros2 in mcap": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), storage="mcap"),
     "ros2, compressed": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), compression="file"),
     "ros_map": test_ros_map.write,
+    "places": _text("a.csv", "time;lat;lon;ele\n" + "".join(f"{k};47.5;8.5{k};4\n" for k in range(1, 9))),
     "sleap": _text("a.csv", test_other_programs.sleap()),
     "tlog": _tlog,
     "trc": _export(trc.EXPORT),
