@@ -93,21 +93,50 @@ def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
     )
 
 
-def fit_to_size(intrinsics: Intrinsics, width: int, height: int) -> tuple[Intrinsics, str | None]:
-    """Adapt intrinsics to the size of the pictures; return them with a note if that differs.
+def is_resized(intrinsics: Intrinsics, width: int, height: int) -> bool:
+    """Test if pictures of this size have the shape of the calibration's: aspect ratios within 0.5 %."""
+    ratio = width * intrinsics.height / (height * intrinsics.width) if height else 0.0
+    return abs(ratio - 1) <= 0.005
 
-    The same shape at another size, with aspect ratios within 0.5 %, means a resized picture: the intrinsics
-    are rescaled. Another shape, with both sides within 2 %, means a picture that its codec cropped or padded:
-    the intrinsics are kept. ValueError: the sizes differ by more than that.
+
+def fit_to_size(
+    intrinsics: Intrinsics, width: int, height: int, bars: tuple[int, int, int, int] = (0, 0, 0, 0)
+) -> tuple[Intrinsics, str | None]:
+    """Adapt intrinsics to the size of the pictures, which may differ from that of the calibration.
+
+    The same shape at another size (`is_resized`) means a resized picture: the intrinsics are rescaled.
+    Another shape, of which the part between black bars has the calibration's shape, means a picture that was
+    resized to fit between them: the intrinsics are rescaled to that part and moved to its corner. Another
+    shape without such bars, with both sides within 2 %, means a picture that its codec cropped or padded: the
+    intrinsics are kept.
+
+    Args:
+        intrinsics: the calibration.
+        height: of the pictures, px.
+        bars: black columns at the left, rows at the top, columns at the right, rows at the bottom, px. They
+            are whole pixels, so each side of the part between them is known to a pixel.
+
+    Returns:
+        The intrinsics to use, and a note if the sizes differ.
+
+    ValueError: the sizes differ by more than that.
     """
     if (width, height) == (intrinsics.width, intrinsics.height):
         return intrinsics, None
     sizes = (
         f"pictures are {width} x {height}, the calibration is for {intrinsics.width} x {intrinsics.height}"
     )
-    sx, sy = width / intrinsics.width, height / intrinsics.height
-    if min(width, height) > 0 and abs(sx / sy - 1) <= 0.005:
+    if min(width, height) > 0 and is_resized(intrinsics, width, height):
         return rescaled(intrinsics, width, height), f"{sizes}: rescaled"
+    left, top, right, bottom = bars
+    inner_width, inner_height = width - left - right, height - top - bottom
+    off_px2 = abs(inner_width * intrinsics.height - inner_height * intrinsics.width)
+    if any(bars) and min(inner_width, inner_height) > 0 and off_px2 <= intrinsics.width + intrinsics.height:
+        inner = rescaled(intrinsics, inner_width, inner_height)
+        moved = replace(inner, width=width, height=height, cx=inner.cx + left, cy=inner.cy + top)
+        shown = f"black bars of {left} px left, {top} above, {right} right, {bottom} below"
+        return moved, f"{sizes}: {shown}; rescaled to the {inner_width} x {inner_height} px between them"
+    sx, sy = width / intrinsics.width, height / intrinsics.height
     if max(abs(sx - 1), abs(sy - 1)) <= 0.02:
         return replace(intrinsics, width=width, height=height), f"{sizes}: within 2 %, used as it is"
     raise ValueError(f"{sizes}: another shape, and more than 2 % off")

@@ -10,9 +10,9 @@ import numpy as np
 
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.videos.picture_folder import taken_ns
-from pipelines.formats.videos.video import created_ns
+from pipelines.formats.videos.video import black_bars, created_ns
 from pipelines.geometry.arrays import Int64, Intrinsics
-from pipelines.geometry.cameras import fit_to_size
+from pipelines.geometry.cameras import fit_to_size, is_resized
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import CameraSources, FrameTimes, IntrinsicsSource
@@ -239,8 +239,12 @@ class FlightCameras:
         if source.readout_s:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
         if size := self._picture_size(camera, video, detections):
+            bars = (0, 0, 0, 0)
+            file = self._files.video_file(camera)
+            if file is not None and not file.is_dir() and not is_resized(intrinsics, *size):
+                bars = black_bars(file)
             try:
-                intrinsics, note = fit_to_size(intrinsics, *size)
+                intrinsics, note = fit_to_size(intrinsics, *size, bars)
             except ValueError as error:
                 remedy = "give the calibration that belongs to these pictures"
                 raise DataError(place, str(error), remedy, code="wrong-size") from None

@@ -147,6 +147,33 @@ def test_a_slightly_other_shape_is_kept_with_a_note() -> None:
     assert "1088 x 1920" in note
 
 
+@pytest.mark.parametrize(
+    ("size", "bars"),
+    [((640, 480), (0, 60, 0, 60)), ((800, 360), (80, 0, 80, 0)), ((1280, 730), (0, 0, 0, 10))],
+    ids=["above and below", "at the sides", "below"],
+)
+def test_a_letterboxed_picture_shows_the_same_rays_between_its_bars(
+    size: tuple[int, int], bars: tuple[int, int, int, int]
+) -> None:
+    fitted, note = fit_to_size(BARREL, *size, bars)
+    points = points_in_view(BARREL)
+    factor = (size[0] - bars[0] - bars[2]) / BARREL.width
+    expected = (project(points, BARREL) + 0.5) * factor - 0.5 + bars[:2]
+    np.testing.assert_allclose(project(points, fitted), expected, rtol=0, atol=1e-10)
+    assert (fitted.width, fitted.height) == size
+    assert note is not None
+
+
+def test_bars_count_only_around_a_picture_of_the_calibrated_shape() -> None:
+    # The real recording: 1080 / 1088 of 1920 rows are 1905.9. 7 rows of bars at both ends leave 1906.
+    calibrated = replace(PINHOLE, width=1088, height=1920)
+    for rows, is_letterboxed in ((5, False), (7, True), (9, False)):
+        fitted, _ = fit_to_size(calibrated, 1080, 1920, (0, rows, 0, rows))
+        assert (fitted.fx < calibrated.fx) == is_letterboxed
+    with pytest.raises(ValueError, match="1280 x 720"):
+        fit_to_size(PINHOLE, 960, 720, (0, 0, 0, 60))
+
+
 @pytest.mark.parametrize("size", [(960, 720), (1280, 700), (720, 1280), (0, 0)])
 def test_another_shape_is_refused_with_both_sizes(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=rf"{size[0]} x {size[1]}.*1280 x 720"):

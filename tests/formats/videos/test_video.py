@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.videos import video
-from pipelines.formats.videos.video import VideoReader, created_ns, frames
+from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames
 from pipelines.geometry.arrays import Picture
 from pipelines.session.recognition import recognise
 from pipelines.session.records import UNTIMED
@@ -374,3 +374,18 @@ def test_the_stated_time_of_creation_is_read(tmp_path: Path, stated: str | None,
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
     assert created_ns(path) == made_ns
+
+
+# --- black bars ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bars", [(0, 0, 0, 0), (0, 7, 0, 8), (33, 0, 21, 0)])
+def test_black_bars_are_counted_to_a_pixel(tmp_path: Path, bars: tuple[int, int, int, int]) -> None:
+    left, top, right, bottom = bars
+
+    def draw(number: int) -> Picture:
+        picture = np.zeros((120, 200, 3), dtype=np.uint8)
+        picture[top : 120 - bottom, left : 200 - right] = (150, 110 + number, 100)
+        return picture
+
+    assert black_bars(write_video(tmp_path / "v.mp4", even_ticks(9), draw=draw)) == bars
