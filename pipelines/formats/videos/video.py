@@ -46,7 +46,8 @@ _MOST_KEY_FRAMES = 3
 _MOST_PIXELS = 1 << 27
 # A codec's noise stays below this brightness (of 255) in black bars.
 _BLACK = 16
-_EYE_BGR = (0.114, 0.587, 0.299)  # weights of the channels in brightness (ITU-R BT.601)
+# Brightness weighs the channels so (ITU-R BT.601).
+_EYE_BGR = (0.114, 0.587, 0.299)
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _PACKET_TS, _PACKET_M2TS = 188, 192
 # The first bytes of containers, and FFmpeg's names of them.
