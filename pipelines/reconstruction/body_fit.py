@@ -57,6 +57,8 @@ _USUAL_SHARE = 0.5
 _USUAL_ELBOW_DEG = -20.0
 # No landmark is surer than this, whatever a covariance says.
 _LEAST_SIGMA_M = 1e-3
+# Nearly parallel rays leave a landmark's depth open: beyond this it has no weight, and stays finite.
+_MOST_SIGMA_M = 100.0
 # A trunk that is shorter or narrower than this has no directions.
 _LEAST_TRUNK_M = 0.02
 # A longer step leaves the range of the linear model.
@@ -247,9 +249,9 @@ def fit_body(
 def _seen(place: Float, covariance: Float) -> _Seen:
     """Invert the covariances of landmarks [N, K, 3]; a landmark without a place has no weight."""
     known = np.asarray(np.isfinite(place).all(axis=-1, keepdims=True))
-    sure = np.where(known[..., None], covariance, np.eye(3)) + _LEAST_SIGMA_M**2 * np.eye(3)
-    inverse = np.linalg.inv(sure)
-    root = np.swapaxes(np.linalg.cholesky(inverse), -1, -2) * known[..., None]
+    variance, axes = np.linalg.eigh(np.where(known[..., None], covariance, np.eye(3)))
+    sigma = np.sqrt(np.clip(variance, 0.0, _MOST_SIGMA_M**2) + _LEAST_SIGMA_M**2)
+    root = np.einsum("...ij,...j,...kj->...ik", axes, 1 / sigma, axes) * known[..., None]
     return _Seen(np.where(known, place, 0.0), root)
 
 

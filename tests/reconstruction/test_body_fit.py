@@ -151,3 +151,17 @@ def test_another_skeleton_and_a_person_without_a_trunk_have_no_body() -> None:
     landmarks = known_landmarks()
     place = np.full((2, len(landmarks.bone), 3), np.nan)
     assert fit_body(landmarks, np.arange(2), place, lambda _: (place, place)) is None
+
+
+def test_depths_that_parallel_rays_leave_open_have_no_weight() -> None:
+    rng, landmarks = np.random.default_rng(7), known_landmarks()
+    points, (poses, shape) = _Points(body_model(), landmarks), moving(rng)
+    place = places(points, poses, _Shared(shape, np.zeros((len(landmarks.bone), 3))))
+    own = np.tile(1e-4 * np.eye(3), (*place.shape[:2], 1, 1))
+    ray = np.array([0.48, 0.64, 0.6])
+    place[:, ::3] += 5.0 * ray
+    own[:, ::3] += 1e18 * np.outer(ray, ray)  # singular to double precision
+    body = fit_body(landmarks, np.arange(TIMES) * 400_000_000, place, partial(errors_of, own))
+    assert body is not None
+    assert np.isfinite(body.centre_covariance).all()
+    assert abs(body.shape[0] - shape[0]) < 4 * np.sqrt(body.shape_covariance[0, 0])
