@@ -45,8 +45,8 @@ from pipelines.reconstruction.picture_map import (
 )
 from pipelines.session.description import read_description
 
-TUNED = ("01-walk", "07-jog", "15-two-people", "21-dance", "05-dance")
-KEPT = ("02-jog", "06-turn", "08-walk", "14-dance", "18-stand")
+TUNED = ("01-walk", "06-turn", "07-jog", "15-two-people", "21-dance", "05-dance")
+KEPT = ("02-jog", "08-walk", "14-dance", "18-stand")
 """The last of each half hovers."""
 LOGS: dict[str, tuple[list[NoiseModel], float]] = {
     "rtk": ([White(position_m=0.02), Bias(position_m=0.05)], 0.1),

@@ -58,7 +58,7 @@ from tests.synthetic.described_flights import (
 
 
 class Outcome(NamedTuple):
-    """What became of a mistake."""
+    """Result of one mistake: its errors, its doubts, and whether the remedy mends it."""
 
     counts: bool  # the error grows by more than 20 %
     doubted: bool

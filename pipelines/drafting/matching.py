@@ -73,7 +73,7 @@ Distance = Callable[[FlownPoses, FlownPoses], float | None]
 
 @dataclass(frozen=True)
 class Question:
-    """What no file tells of a camera: a key of the manifest, and its possible values, the likeliest first."""
+    """Question to the user about a key of a camera, with its possible values, the likeliest first."""
 
     camera: str
     key: str

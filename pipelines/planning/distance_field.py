@@ -209,7 +209,7 @@ def fill_bricks(grid: Grid, bricks: NDArray[np.uint8]) -> None:
 
 
 Unknown = Literal["free", "occupied", "avoided"]
-"""What nothing is known of: free, an obstacle that hides, or an obstacle that cameras see through."""
+"""Meaning of unknown voxels: free, an obstacle that hides, or an obstacle that cameras see through."""
 
 
 @dataclass(frozen=True)

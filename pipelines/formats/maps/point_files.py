@@ -300,7 +300,7 @@ def _add_points(path: Path, header: Any, voxels: VoxelSet) -> dict[str, int]:
                 voxels.add(points[~bad & ~hidden])
                 lost["points marked as noise"] += int(bad.sum())
                 lost["points marked as withheld"] += int(hidden.sum())
-    except (DataError, KeyboardInterrupt):
+    except (DataError, KeyboardInterrupt, MemoryError, SystemExit):
         raise
     except BaseException as error:  # panics of the decompressor have the base of all exceptions
         if not read:

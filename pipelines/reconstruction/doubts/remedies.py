@@ -18,7 +18,7 @@ from pipelines.session.description import CameraEntry, PosesEntry
 
 
 class _Filming(Protocol):
-    """What remedies read of a camera: `scene.Filmed` is one."""
+    """Interface of a camera for remedies; `scene.Filmed` has it."""
 
     @property
     def name(self) -> str: ...
