@@ -5,8 +5,6 @@ Hypothesis has no deadlines here, and uses the same few examples every time, but
 HYPOTHESIS_PROFILE=explore make test
 """
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Expectation of errors by their codes, never by their words."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

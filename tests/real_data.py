@@ -1,7 +1,5 @@
 """Real recordings and networks that some tests use; where they cannot be had, those tests are skipped."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

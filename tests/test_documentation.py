@@ -1,7 +1,5 @@
 """The documentation is true: commands parse, files exist, tables are those of the code, and examples run."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import json

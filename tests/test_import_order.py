@@ -1,7 +1,5 @@
 """Cost and order of imports, which only a fresh process can show."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys

@@ -4,8 +4,6 @@ The diagnosis of mistakes is tested by tests/reconstruction/test_doubts.py, the 
 tests/reporting. A module with `WHOLE = True` runs both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

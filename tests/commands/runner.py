@@ -4,8 +4,6 @@ Commands run in this process, because starting Python with all imports takes lon
 of the process itself (signals, memory, imports) start one, by `mocap_process` or from `MOCAP`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The actor's log, a gimbal's angles, and a floor plan with its picture, through the commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

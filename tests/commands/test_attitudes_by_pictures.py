@@ -1,7 +1,5 @@
 """Flights whose logs have places alone: the film says how the cameras turned."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

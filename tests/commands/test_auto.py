@@ -1,7 +1,5 @@
 """`mocap reconstruct` without a method: every part takes part that can, and the rest is said."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`mocap batch`: many flights on Dask, with the same results as single runs."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Iterator

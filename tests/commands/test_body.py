@@ -1,7 +1,5 @@
 """Bodies through the commands: a simulated person whose shape and surface are known, and the export."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

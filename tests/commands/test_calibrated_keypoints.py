@@ -1,7 +1,5 @@
 """Calibrated confidences of a detector: they change the weights of keypoints, not which are used or drawn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

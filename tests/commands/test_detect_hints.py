@@ -1,7 +1,5 @@
 """Hints for the detector from the actor's log, and changes that make the stage run again."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

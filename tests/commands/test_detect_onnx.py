@@ -1,7 +1,5 @@
 """The user's own model through the commands: spans, errors, and a kill in the middle."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

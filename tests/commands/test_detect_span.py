@@ -1,7 +1,5 @@
 """Stage `detect` on a span of the flight, called as the stages above call it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pandas as pd

@@ -1,7 +1,5 @@
 """The real detector on real pictures, from video files to a skeleton, as commands."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Flights with poses from the drones' own logs, through the commands: every camera's poses are right."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`mocap export` as a command: every format at once, what may be replaced, C3D as truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sessions of others, and machines that are short of something: one line, and no harm to the user's files."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

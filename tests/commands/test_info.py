@@ -1,7 +1,5 @@
 """`mocap info`: descriptions of mocap's own files and folders, and errors of others."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Formats that need the other parts of a flight: a size from the pictures, a world from the first camera."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

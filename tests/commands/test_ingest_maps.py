@@ -1,7 +1,5 @@
 """Maps from logs through the commands: stored with their times, like those of files, and replayed."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Ingest of logs: it opens each log once, always closes it, and needs no more memory for a longer one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`mocap init`: the draft describes the flight correctly, or says what is missing."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

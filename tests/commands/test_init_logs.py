@@ -1,7 +1,5 @@
 """`mocap init` beside logs of drivers and of drones: what it drafts, `mocap ingest` takes."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Two writers: the second one reports the first. Kills are tested in tests/kills."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipelines.session.stages import locked

@@ -1,7 +1,5 @@
 """Flights with poses, intrinsics and pictures in logs: every container, and effects of damage."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Long flights: their joint estimate in windows, here of seconds for minutes, and their page."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

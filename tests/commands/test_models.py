@@ -1,7 +1,5 @@
 """`mocap models`; no test here needs a network."""
 
-from __future__ import annotations
-
 import tarfile
 from pathlib import Path
 

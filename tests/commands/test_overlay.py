@@ -1,7 +1,5 @@
 """`mocap export --to overlay`: the skeleton is drawn where geometry predicts, on every picture."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Flights with pictures: container stamps, overlays on frames, and pictures that are gone."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The whole pipeline from files to a measured skeleton, as commands."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

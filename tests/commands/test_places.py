@@ -1,7 +1,5 @@
 """Flights whose sources are in a map projection: everything lies where it was flown."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Real logs, maps and calibrations, ingested by commands: the session agrees with facts.json."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

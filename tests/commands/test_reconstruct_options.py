@@ -1,7 +1,5 @@
 """Options of `mocap reconstruct`: disturbed poses, filled gaps, smoothing, logged covariances."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`mocap reconstruct --method refined` as a command."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

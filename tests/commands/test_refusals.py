@@ -1,7 +1,5 @@
 """Input that cannot be used: one line with the file, what is wrong and what to do, and exit status 1."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

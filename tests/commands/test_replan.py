@@ -1,7 +1,5 @@
 """`mocap replan-compare` on short simulated flights: order of the arms, stored results and refusals."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`mocap replan-compare --render`: a short flight filmed again, in small pictures, by the real detector."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`plan:` of flight.yaml: the commands in flight as the arm `planned`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

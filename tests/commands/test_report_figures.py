@@ -1,7 +1,5 @@
 """`mocap report --figures`: of one session, and of two that are compared."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

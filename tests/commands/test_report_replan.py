@@ -1,7 +1,5 @@
 """The report shows the comparison of planners that lies in the session, and a study beside it."""
 
-from __future__ import annotations
-
 from html import unescape
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`mocap report --study`: a study on a session's page, only if it is requested."""
 
-from __future__ import annotations
-
 import json
 import re
 from html import unescape

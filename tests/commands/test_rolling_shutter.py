@@ -1,7 +1,5 @@
 """The real detector on film with a rolling shutter: joints count at the times of their rows."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`mocap run`: one command from a folder to the verdict."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The sample flight with the real detector: results that the README states."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Several flights or sessions for one command, or a pattern that the shell did not expand."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

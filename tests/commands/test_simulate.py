@@ -1,7 +1,5 @@
 """Simulated flights through the commands: results agree with the truth, other programs read the files."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Studies: exact data give no error, errors have the size that geometry predicts, and sessions are ranked."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Output of commands: names and texts from files must not control a terminal or start new lines."""
 
-from __future__ import annotations
-
 import ast
 import unicodedata
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cameras that take their pictures at different times, at different rates, or irregularly."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Points of known scenes, seen by cameras whose motion is known by formula, against logged poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

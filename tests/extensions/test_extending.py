@@ -1,7 +1,5 @@
 """The package of examples/extension beside mocap, found only by its entry points."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Cloud that the tests of PCD and PLY write in every encoding of these formats."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipelines.geometry.arrays import Float

@@ -1,7 +1,5 @@
 """Recording with known numbers, for the tests of exports."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Foxglove's schemas as dynamic protobuf messages, built as in a reader of MCAP."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from google.protobuf import (

@@ -1,7 +1,5 @@
 """Short flight as log entries: odometry, pictures and a topic that is not requested."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Decoded messages in the form of the log readers: ROS 1, ROS 2, Foxglove's JSON and protobuf."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 from typing import Any

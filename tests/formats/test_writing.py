@@ -1,7 +1,5 @@
 """Files of the simulator, read by our own readers and by those of other projects."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

@@ -1,7 +1,5 @@
 """Trajectories drawn by hypothesis for round trips."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 

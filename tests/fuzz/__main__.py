@@ -1,7 +1,5 @@
 """Long run of the fuzz tests: `python -m tests.fuzz`, and with `--crafted` that of the crafted inputs."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -3,8 +3,6 @@
 Each class is a generator of inputs. An input is written into an empty folder, and one entry of it is read.
 """
 
-from __future__ import annotations
-
 import bz2
 import json
 import sqlite3

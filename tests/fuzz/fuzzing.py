@@ -1,7 +1,5 @@
 """Driver of the fuzz tests: damages seeds and watches the process that reads them."""
 
-from __future__ import annotations
-
 import random
 import shutil
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Damage to files as by disks, networks and attackers, the same for the same seed."""
 
-from __future__ import annotations
-
 import random
 import re
 import struct

@@ -1,7 +1,5 @@
 """Reading of a file in all ways that commands use, by every reader that takes it."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from functools import partial

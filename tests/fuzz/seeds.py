@@ -1,7 +1,5 @@
 """Seeds to damage: a small valid file, or folder, of every format and of its variants."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

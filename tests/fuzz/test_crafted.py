@@ -1,7 +1,5 @@
 """Crafted files are read or refused in little time and memory: some classes of `tests.fuzz --crafted`."""
 
-from __future__ import annotations
-
 from itertools import chain, islice
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Damaged files are read or refused in one line; a short run of `python -m tests.fuzz`."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Alignments against known motions, the least-squares property, and the cases without an answer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

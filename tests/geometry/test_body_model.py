@@ -1,7 +1,5 @@
 """The body that is fitted, against the simulated person who has the same mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Intervals of means over time, against the known variances of the series."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Cameras against OpenCV's own projection, and back again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Steps of a clock that stamps messages: found, told apart from delays, and taken out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

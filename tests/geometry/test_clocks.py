@@ -1,7 +1,5 @@
 """Offset and drift between two clocks, from events that both stamped."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Gait of feet that swing as cosines about a pelvis that moves evenly: events at their extremes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Conversion of latitude and longitude to metres, against published examples and an independent inverse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Joint angles of limbs that are built from known angles; standard deviations against drawn errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

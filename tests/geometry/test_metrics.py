@@ -1,7 +1,5 @@
 """Errors calculated by hand for skeletons of a few joints, and changes that a metric must ignore."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mounts and gimbals against the worked example of docs/flight.md, axis by axis, and by their algebra."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Pose errors: draws have the stated scatter in the stated frame, and invalid parameters are refused."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

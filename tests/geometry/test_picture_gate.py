@@ -1,7 +1,5 @@
 """Gross errors that pose noise hides: the picture gate finds them, and nothing else changes."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

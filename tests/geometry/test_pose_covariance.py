@@ -1,7 +1,5 @@
 """Covariances against samples: errors are drawn in the log's convention and measured in the session's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Rotations against scipy, transforms by their algebra, interpolation by closed-form motion."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

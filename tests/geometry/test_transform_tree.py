@@ -1,7 +1,5 @@
 """Chains through a tree of transforms: closed-form motion, both directions, gaps, wrong names."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

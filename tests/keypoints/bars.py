@@ -6,8 +6,6 @@ picture's longer side, joints come from a region of about 1.25 H, and one pass f
 centred confuses left and right.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -8,8 +8,6 @@ It needs its own environment, because mediapipe 0.10.21 is not compatible with o
 The videos are those of the Pose2Sim single-person demo (BSD-3), as they come in its package.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

@@ -4,8 +4,6 @@ A pose model here divides its input into bands of equal height, two by default: 
 place of the band j modulo their number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Flights with videos of a person made of three bright spots, and ONNX models that find them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path

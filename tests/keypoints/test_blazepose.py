@@ -1,7 +1,5 @@
 """Default detector against MediaPipe itself, and its parts against closed forms."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import dataclass

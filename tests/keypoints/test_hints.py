@@ -1,7 +1,5 @@
 """Place of the actor in the picture, against a pinhole computed by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

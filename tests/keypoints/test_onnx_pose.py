@@ -1,7 +1,5 @@
 """Detector with the user's own model: crop, network and decoding give joints at known places."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Real recording: four static cameras, one person of interest, bystanders in two of the views."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Exchanges of left and right in a walk with known joints, in one camera that circles it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

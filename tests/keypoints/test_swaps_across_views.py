@@ -1,7 +1,5 @@
 """Exchanges of left and right in some of the cameras around a walk with known joints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tiles of large pictures: their cover, and detection of each person exactly once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

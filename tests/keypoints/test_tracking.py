@@ -1,7 +1,5 @@
 """Tracking of people through pictures in which their places are known."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 

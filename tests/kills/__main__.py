@@ -1,7 +1,5 @@
 """Long run of the kill tests: `python -m tests.kills`; `--power` loses power."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

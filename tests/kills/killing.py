@@ -1,7 +1,5 @@
 """Kills of commands at random moments, second runs, and comparison of their files with an undisturbed run."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess

@@ -10,8 +10,6 @@ From a trace follow the states of the disk that a loss of power may leave at eac
   anywhere, be zeros, or be missing.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

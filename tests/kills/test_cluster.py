@@ -1,7 +1,5 @@
 """`mocap batch` on a cluster of processes, one of which is killed: nothing is lost, bytes are the same."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

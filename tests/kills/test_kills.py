@@ -1,7 +1,5 @@
 """A short share of `python -m tests.kills`, on keypoints in place of a detector."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A short share of `python -m tests.kills --power`, and what its states must be."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

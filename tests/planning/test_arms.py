@@ -1,7 +1,5 @@
 """The search in one compiled call against its parts, one after the other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Means, differences and their intervals against known properties of the bootstrap."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings from mappings: accepted values, and refusals."""
 
-from __future__ import annotations
-
 import pytest
 
 from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config

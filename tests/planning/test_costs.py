@@ -1,7 +1,5 @@
 """The cost map by hand, and the information of cameras by the ray model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

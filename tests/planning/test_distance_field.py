@@ -1,7 +1,5 @@
 """Distances to known surfaces, and gradients that are the derivative of the interpolated value."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

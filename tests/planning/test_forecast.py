@@ -1,7 +1,5 @@
 """The actor's filter: closed forms, causality, and errors as large as it says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

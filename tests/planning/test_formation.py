@@ -1,7 +1,5 @@
 """Slots, their approach, and the view of the cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Planning for several people, where the answer is known, and the arm `group` in flight."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The invariant that keeps replayed drones safe, for any plan."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The local planner: exact gradients, its metric, obstacles it leaves and drones it keeps away from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

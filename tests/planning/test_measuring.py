@@ -1,7 +1,5 @@
 """Measurements of replayed cameras, where the result is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

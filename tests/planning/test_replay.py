@@ -1,7 +1,5 @@
 """Whole flights past known obstacles: the seed's comparison, limits, causality, repeatability."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

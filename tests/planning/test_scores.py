@@ -1,7 +1,5 @@
 """Figures of flights that are known by construction."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

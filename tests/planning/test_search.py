@@ -1,7 +1,5 @@
 """Dynamic programming against every possible sequence."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sight lines against a plain and slow reference."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Plans between their waypoints, and point masses that follow them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

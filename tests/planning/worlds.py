@@ -1,7 +1,5 @@
 """Maps with a known shape, and an actor who walks a straight line past them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Flights in memory for the refinement: a walk, cameras around it, noisy logs and keypoints."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Attitudes from a static background: hovering and flying cameras against true poses, levels, covariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

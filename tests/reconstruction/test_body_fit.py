@@ -1,7 +1,5 @@
 """Fit of the body: derivatives against differences, and modelled people whose shape and pose are known."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

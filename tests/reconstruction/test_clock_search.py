@@ -1,7 +1,5 @@
 """Initial clock offsets: within a step of the truth for any pose errors, or 0."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

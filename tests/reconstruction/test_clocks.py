@@ -1,7 +1,5 @@
 """Clock offsets: found if the person moves, and reported as unknown if nothing moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

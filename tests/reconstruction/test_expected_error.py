@@ -1,7 +1,5 @@
 """Verdicts without truth: the expected error follows the covariances, and the grade follows both."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Filling of gaps: the choice of gaps, the filled values, and the calibration of their covariance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Logs that stand still and jump on, or jump away and back: their wrong stretches lose their weight."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """White pose errors with a logged covariance for each pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

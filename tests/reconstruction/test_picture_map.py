@@ -1,7 +1,5 @@
 """Attitudes by pictures, on features and places with known truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Faults of one camera's poses: what is fitted to exact rays is the fault that was made."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import cast
 

@@ -1,7 +1,5 @@
 """Covariances where nobody stated the poses' errors, and errors of which only a level is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

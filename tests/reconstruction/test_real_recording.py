@@ -1,7 +1,5 @@
 """A real recording with four still cameras, against the result that Pose2Sim 0.10.49 published of it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

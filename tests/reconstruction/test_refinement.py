@@ -1,7 +1,5 @@
 """Refinement: derivatives, equations and covariances against slow computations, results against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

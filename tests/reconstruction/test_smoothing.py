@@ -1,7 +1,5 @@
 """The filter against its closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

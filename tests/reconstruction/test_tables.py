@@ -1,7 +1,5 @@
 """Tables of a reconstruction: pictures without a pose have no row."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

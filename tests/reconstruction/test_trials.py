@@ -1,7 +1,5 @@
 """Disturbed poses: independence of the random draws, refused options, and the summary of several trials."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

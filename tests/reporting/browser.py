@@ -4,8 +4,6 @@ Speaks the DevTools protocol over a pipe: messages of JSON, each ended by a NUL 
 browser's descriptor 3 and written to its descriptor 4.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import os

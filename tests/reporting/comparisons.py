@@ -1,7 +1,5 @@
 """A comparison of planners in closed form: an actor who walks east, drones on a circle about him, a block."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A session in closed form: an actor on a circle, three cameras, known shares of every status."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

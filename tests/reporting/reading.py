@@ -1,7 +1,5 @@
 """Readers of pages and sentences: their numbers, rows and elements, whatever the words between them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """The page in a real browser: it plays, turns and prints without a word on the console."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator
 from dataclasses import replace

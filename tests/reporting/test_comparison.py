@@ -1,7 +1,5 @@
 """Sessions side by side: differences that are known in closed form, and the page that shows them."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from urllib.parse import unquote

@@ -1,7 +1,5 @@
 """The comparison as a file: its place, and no overwriting of foreign files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

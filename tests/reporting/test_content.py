@@ -1,7 +1,5 @@
 """The cameras as used by a reconstruction: refined poses before logged ones, frames by estimated clocks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures: their numbers are those of the data, and their files are the same every time."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Mapping

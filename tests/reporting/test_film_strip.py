@@ -1,7 +1,5 @@
 """Pictures beside the 3D view: their number follows from a budget, and the joints lie in them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The table of data quality, against errors that were put in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A comparison in numbers: the tracks of every arm, the rows of the tables, the map around."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page's words about a study, against metrics with chosen numbers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pipelines.reporting.content import StudyContent

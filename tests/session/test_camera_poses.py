@@ -1,7 +1,5 @@
 """Use of logged covariances: which of them are accepted."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipelines.geometry.arrays import Float

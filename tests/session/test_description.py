@@ -1,7 +1,5 @@
 """session.json of a foreign session: it may only hold names that flight.yaml may hold."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Codes of errors: every one that the source gives is in the list, and travels between processes."""
 
-from __future__ import annotations
-
 import ast
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Maps of a session: they are stored and read back byte for byte, and bad files are refused."""
 
-from __future__ import annotations
-
 import io
 import json
 import time

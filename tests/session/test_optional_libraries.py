@@ -1,7 +1,5 @@
 """Hints on missing libraries: every hint names existing packages, and these provide the imported module."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex
@@ -37,20 +35,22 @@ def calls() -> list[tuple[str, str]]:
     """Find module and extra of every call of `need` in the program."""
     found = []
     for path in sorted((ROOT / "pipelines").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "need(" in text else ():
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "need":
                 module, extra = (ast.literal_eval(argument) for argument in node.args)
                 found.append((module, extra))
     return sorted(set(found))
 
 
-@pytest.mark.parametrize(("module", "extra"), calls())
-def test_the_hint_installs_the_library_that_is_imported(module: str, extra: str) -> None:
-    command, *requirements = shlex.split(install_command(extra).removeprefix("pip "))
-    assert command == "install"
-    assert sorted(requirements) == sorted(EXTRAS[extra])
-    brought = {name_of(requirement) for requirement in requirements}
-    assert brought & {name_of(name) for name in packages_distributions()[module.partition(".")[0]]}
+def test_hints_install_the_libraries_that_are_imported() -> None:
+    distributions = packages_distributions()
+    for module, extra in calls():
+        command, *requirements = shlex.split(install_command(extra).removeprefix("pip "))
+        assert command == "install"
+        assert sorted(requirements) == sorted(EXTRAS[extra])
+        brought = {name_of(requirement) for requirement in requirements}
+        assert brought & {name_of(name) for name in distributions[module.partition(".")[0]]}, module
 
 
 def test_what_is_missing_is_one_line_with_the_command() -> None:

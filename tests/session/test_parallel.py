@@ -1,7 +1,5 @@
 """Parts of a flight on several processes: their results, their errors, and what a worker refuses."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Truth between its samples: gaps stay gaps for any spacing of the samples."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

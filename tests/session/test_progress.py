@@ -1,7 +1,5 @@
 """Parallel parts: results are in order, and one failure ends the others."""
 
-from __future__ import annotations
-
 from threading import Barrier
 
 import pytest

@@ -1,7 +1,5 @@
 """Files that no format reads: the line says their likely kind, and recognising them never raises."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

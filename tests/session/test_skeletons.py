@@ -1,7 +1,5 @@
 """Skeleton definitions: orders against the detectors' own numbering, symmetry, mapping, derived joints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

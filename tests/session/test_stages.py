@@ -1,7 +1,5 @@
 """A stage survives a kill at every step, a second writer, a full disk and damage."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Storage: JSON is reproducible, hashes detect every change, errors are one line."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables read in parts: the same as read as a whole, however their rows lie in the file."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Sources and sessions that are named by URL."""
 
-from __future__ import annotations
-
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread

@@ -1,7 +1,5 @@
 """Whole folders: they appear complete or not at all, and finished parts survive an interrupt."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The modelled detector: errors as large as the table says, and connected as the module says."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from pathlib import Path

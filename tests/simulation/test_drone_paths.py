@@ -1,7 +1,5 @@
 """Formations: the places of the cameras, and the person in their pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

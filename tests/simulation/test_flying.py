@@ -1,7 +1,5 @@
 """Drones that fly: within their limits, as control theory predicts, leaning and looking as they should."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

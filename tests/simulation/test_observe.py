@@ -1,7 +1,5 @@
 """Simulated instruments: exact without noise, and with it as noisy as they say."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

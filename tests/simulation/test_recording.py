@@ -1,7 +1,5 @@
 """Simulated recorders: their stamps, their exact poses, and errors as large as they say."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

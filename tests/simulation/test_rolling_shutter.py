@@ -1,7 +1,5 @@
 """A person's motion between the moments of pictures, which a rolling shutter needs."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipelines.simulation.flight import fly_scenario

@@ -1,7 +1,5 @@
 """The sample flight in the repository: what its scenario makes, small, and as its README describes it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

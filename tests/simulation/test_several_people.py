@@ -1,7 +1,5 @@
 """Flights of several people: each has a motion and a log of their own, and bodies hide each other."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

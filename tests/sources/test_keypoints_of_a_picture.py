@@ -1,7 +1,5 @@
 """Keypoints against the size of their picture: kept, dropped, or of a picture of another size."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

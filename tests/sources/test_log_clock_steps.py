@@ -1,7 +1,5 @@
 """A clock that steps in flight: poses, pictures and positions of a log stay at the right times."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

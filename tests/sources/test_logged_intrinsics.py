@@ -1,7 +1,5 @@
 """Camera infos of a log: those that are not calibrated, that change, and that are binned."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

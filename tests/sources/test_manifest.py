@@ -1,7 +1,5 @@
 """Sources of a manifest: their formats by content, the options of each, and the spellings of old files."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A world that is turned, scaled or elsewhere, and the keys that undo it: the session is the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ A mistake changes the poses that are written, the keypoints, or the manifest; it
 doubts that name it. `KEPT_ASIDE` holds flights on which no constant was tuned.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -4,8 +4,6 @@ By the packages' public definitions (gps_umd). Logs hold their own definitions, 
 message that no reader asks for are left out here.
 """
 
-from __future__ import annotations
-
 from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
 

@@ -3,8 +3,6 @@
 Written by the published formats with `struct` alone, without the libraries that the readers use.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Small simulated flights as files, for tests that drive the commands: with known truth, in any format."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

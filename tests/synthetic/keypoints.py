@@ -1,7 +1,5 @@
 """Keypoints of a simple detector on exact pixels: white noise, missed joints, gross outliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

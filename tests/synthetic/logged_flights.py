@@ -1,7 +1,5 @@
 """Flight of two drones as their recorders store it: odometry, camera info and pictures in a log."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ in the spelling of ROS 2; a stamp is a plain number of nanoseconds. The same ent
 a ROS 2 bag or MCAP. Foxglove's types (`foxglove.PoseInFrame`) go into MCAP as json or protobuf.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Messages of maps as they are recorded: OctoMaps, floor plans and clouds."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 Odometry comes at 100 Hz, an IMU at 200 Hz, a transform at 100 Hz and pictures at 30 Hz.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """GoPro's telemetry tracks, byte for byte, beside pictures."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """Small videos whose frames show their own number: a bar code of 16 blocks, white for a set bit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path

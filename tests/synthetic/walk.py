@@ -7,8 +7,6 @@ within 3 degrees of those curves so that the speed over the stance foot is even.
 fractions of the body's height after Drillis & Contini (in Winter 2009, chapter 4).
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

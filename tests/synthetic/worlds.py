@@ -4,8 +4,6 @@ Drones start beside obstacles, too. The planner's map is made of voxels; flights
 analytic surfaces that the voxels were made from.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Calibrations of anipose, Pose2Sim and caliscope, on real files and against OpenCV's projection."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

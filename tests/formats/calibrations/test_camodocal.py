@@ -1,7 +1,5 @@
 """Calibrations of camodocal, as VINS has them: compared with OpenCV, and with Mei's formula."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

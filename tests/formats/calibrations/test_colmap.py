@@ -1,7 +1,5 @@
 """COLMAP models, text and binary, against pycolmap's own writing and projection."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

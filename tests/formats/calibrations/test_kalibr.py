@@ -1,7 +1,5 @@
 """Kalibr camera chains: a real one, and faulty ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

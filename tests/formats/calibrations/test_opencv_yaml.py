@@ -1,7 +1,5 @@
 """OpenCV FileStorage calibrations, written by OpenCV itself."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """ORB-SLAM's settings: a real file of version 2, and files of the versions by their public descriptions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

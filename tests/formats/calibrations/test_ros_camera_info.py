@@ -1,7 +1,5 @@
 """ROS camera calibrations: real files of both forms, and faulty ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

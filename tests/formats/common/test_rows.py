@@ -1,7 +1,5 @@
 """Time stamps that keep every nanosecond, in every form."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """ArduPilot's logs, written byte by byte in the published format, with known truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

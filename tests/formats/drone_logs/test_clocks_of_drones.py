@@ -1,7 +1,5 @@
 """Restarts and steps of GPS time in the logs of autopilots: all times are right, and it is said."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

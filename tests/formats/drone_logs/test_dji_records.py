@@ -3,8 +3,6 @@
 The headings are those that these services document and that public readers of their files name.
 """
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

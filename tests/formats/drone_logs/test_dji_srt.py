@@ -1,7 +1,5 @@
 """DJI's subtitles: real files of every generation, and the meaning of their fields."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

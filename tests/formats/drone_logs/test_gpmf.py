@@ -1,7 +1,5 @@
 """GoPro's telemetry: a real Karma's, and packets written byte by byte after GoPro's description."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Places without attitudes: GPX by an independent program, and tables."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ground stations' logs of MAVLink: a real one against pymavlink, others byte by byte."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 

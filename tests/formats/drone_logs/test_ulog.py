@@ -1,7 +1,5 @@
 """PX4's logs: real ones against facts.json, and written ones with known truth."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

@@ -1,7 +1,5 @@
 """AlphaPose results: the real file, and small ones with every special case of the format."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """COCO keypoint results and annotations: the real files, and small ones."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

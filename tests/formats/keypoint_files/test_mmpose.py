@@ -1,7 +1,5 @@
 """MMPose predictions in each form that its inferencer and demos save."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

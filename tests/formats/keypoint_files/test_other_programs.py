@@ -1,7 +1,5 @@
 """Keypoints of EasyMocap, Ultralytics, DeepLabCut and SLEAP: small files after the public descriptions."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

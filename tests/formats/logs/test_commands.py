@@ -1,7 +1,5 @@
 """Setpoints and plans as the on-board planner published them: the valid point at each time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Maps in logs: the same map as in a file, in every container, and at its place in the world."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

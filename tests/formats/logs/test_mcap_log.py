@@ -1,7 +1,5 @@
 """MCAP in every encoding and layout: whole, without end or index, cut, damaged, and with absurd lengths."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Conversion of messages of every schema to samples: the same content gives the same samples."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """CameraPictures of logs in every layout that ROS names: decoded colours equal the encoded ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

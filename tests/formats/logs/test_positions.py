@@ -1,7 +1,5 @@
 """Positions and attitudes of separate topics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

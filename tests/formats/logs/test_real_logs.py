@@ -1,7 +1,5 @@
 """Real logs: `describe` and `messages` agree with the reference readers of the same files."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

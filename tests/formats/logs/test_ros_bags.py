@@ -1,7 +1,5 @@
 """ROS 1 and ROS 2 bags: every storage gives the same messages; a damaged bag gives its readable ones."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Trajectories built from samples: stamps compared, losses counted, transforms chained."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Voxel maps as npz, as written by a user's own script."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """LAS and LAZ, written by laspy."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """OctoMap: trees written here by another algorithm than the reader's, and real maps with known contents."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

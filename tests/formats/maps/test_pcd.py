@@ -1,7 +1,5 @@
 """PCD in every encoding, with fields in any order and of any type, and real clouds."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """PLY in every encoding and byte order, clouds and meshes, and a real cloud."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

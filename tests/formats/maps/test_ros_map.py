@@ -1,7 +1,5 @@
 """Floor plans: map_server's rules on small pictures, turned plans, and the real ones."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

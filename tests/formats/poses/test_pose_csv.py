@@ -1,7 +1,5 @@
 """Poses as CSV: columns by name, EuRoC's header, covariances."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

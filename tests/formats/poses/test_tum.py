@@ -1,7 +1,5 @@
 """TUM trajectories: rows that are read, dropped and counted, and files that are refused."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Writer of skinned bodies: skinned as glTF says, against the surface of the model, and read by trimesh."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Writer of GLB: read by trimesh, and its animation against the motion that was written."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

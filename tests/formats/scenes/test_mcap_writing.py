@@ -1,7 +1,5 @@
 """Export to MCAP: the mcap library finds valid schemas, and rosbags decodes the messages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

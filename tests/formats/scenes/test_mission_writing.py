@@ -1,7 +1,5 @@
 """Export to mission: other readers find each waypoint and setpoint on the circle that was planned."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from dataclasses import replace

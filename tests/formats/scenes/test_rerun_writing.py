@@ -1,7 +1,5 @@
 """Export to Rerun, read back by Rerun's own reader."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

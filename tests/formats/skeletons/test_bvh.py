@@ -1,7 +1,5 @@
 """BVH: small files whose joints can be computed on paper, and real ones with reference values."""
 
-from __future__ import annotations
-
 import json
 from itertools import permutations
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Writer of BVH: rigs of motions with known bones, read by bvhtoolbox and by our own reader."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """C3D: our files read by ezc3d and by our reader; files of other programs; damaged files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

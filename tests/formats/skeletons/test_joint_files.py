@@ -1,7 +1,5 @@
 """Resampling of times to frames: values that are kept, interpolated or refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """3D joints as a long CSV, and the csv export."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

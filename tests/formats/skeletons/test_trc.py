@@ -1,7 +1,5 @@
 """TRC: real files of Pose2Sim, small ones, and our own."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Frame times: CSV of several forms, real DJI subtitles, and damage."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Folders of pictures: EXIF written by Pillow, XMP by DJI's names, pixels by OpenCV."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Videos with known stamps; FFmpeg's plain decoding and OpenCV give the expected values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path

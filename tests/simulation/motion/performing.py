@@ -1,7 +1,5 @@
 """Simulated performances of scripts, and measures of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

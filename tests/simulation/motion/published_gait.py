@@ -21,8 +21,6 @@ the mean of the data sets' values, and at a share of the stride where one of the
 samples, is within 1 deg of its extreme.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

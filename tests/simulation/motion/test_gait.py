@@ -1,7 +1,5 @@
 """Walking and jogging against published kinematics and the ground."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recorded motion on our bones: known motions under foreign names, scales and rest poses come back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scripts of actions: their ends, their effects, and no jumps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rendered pictures against the geometry of the scene."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

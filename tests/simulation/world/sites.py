@@ -1,7 +1,5 @@
 """Worlds with a bit of everything, for tests."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float

@@ -1,7 +1,5 @@
 """Drawn surfaces against the solids."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

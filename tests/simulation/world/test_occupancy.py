@@ -1,7 +1,5 @@
 """The map against what is solid, point by point."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipelines.geometry.arrays import Float

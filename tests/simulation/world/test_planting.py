@@ -1,7 +1,5 @@
 """Woods keep clear of the actor, and say so when they cannot."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

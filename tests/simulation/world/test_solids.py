@@ -1,7 +1,5 @@
 """Hidden: against shapes worked out on paper, and against marching through what is solid."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

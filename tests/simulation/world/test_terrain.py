@@ -1,7 +1,5 @@
 """The ground against its closed form, and its bounds against dense sampling."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipelines.geometry.arrays import Float
