@@ -97,9 +97,6 @@ class _Questions:
             DataError: it is not; the manifest says what can be written instead.
         """
         if not click.confirm(f"assumed: {one_line(remark)}. Is that right?", default=True, err=True):
-            raise DataError(
-                manifest,
-                f"assumes what is not right: {one_line(remark)}",
-                "correct the line, take `assumed: true` away, and run the same command again",
-                code="incomplete",
-            )
+            problem = f"assumes what is not right: {one_line(remark)}"
+            remedy = "correct the line, take `assumed: true` away, and run the same command again"
+            raise DataError(manifest, problem, remedy, code="incomplete")

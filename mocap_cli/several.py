@@ -54,12 +54,9 @@ def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any])
 
         url = url_of(place) or ""
         if options.get("scheduler"):
-            raise DataError(
-                url,
-                "is copied to this machine, where no worker of a cluster sees it",
-                "leave --scheduler out, or copy the session to a folder that all machines see",
-                code="bad-option",
-            )
+            problem = "is copied to this machine, where no worker of a cluster sees it"
+            remedy = "leave --scheduler out, or copy the session to a folder that all machines see"
+            raise DataError(url, problem, remedy, code="bad-option")
         if argument == "session" or (argument == "path" and holds_session(url)):
             own[argument] = stack.enter_context(session_here(place))
             if (
@@ -71,12 +68,8 @@ def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any])
             output = output or (place.with_suffix(suffix) if argument == "flight" else None)
     if output is not None and is_url(output):
         if argument != "flight":
-            raise DataError(
-                output,
-                "is a URL, and must be a path here",
-                "write it here, and copy it there",
-                code="url-refused",
-            )
+            problem = "is a URL, and must be a path here"
+            raise DataError(output, problem, "write it here, and copy it there", code="url-refused")
         from pipelines.session.urls import session_here
 
         own["output"] = stack.enter_context(session_here(output, create=True))

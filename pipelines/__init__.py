@@ -1,8 +1,7 @@
 """Measured 3D motion of a person, from the logs and videos of the drone team that filmed it.
 
-The modules directly in this package are the stages (ingest, reconstruct, report, ...): each loads
-tables from a session, makes one call into a room (`geometry`, `formats`, `reconstruction`, ...) and
-stores what comes back. Everything here can be called from a notebook; nothing here prints.
+The modules directly in this package are the stages: each loads tables from a session, calls rooms, and stores
+what comes back. Everything here can be called from a notebook; nothing here prints.
 """
 
 # pycolmap's wheel exports its own zlib symbols. If it is loaded before the system's libz, later PNG

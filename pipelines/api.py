@@ -75,10 +75,6 @@ def angles(session: Path) -> pd.DataFrame:
 
 def _reconstructed(session: Path, name: str, schema: pa.Schema) -> pd.DataFrame:
     if open_session(session).intact_record("reconstruct") is None:
-        raise DataError(
-            session,
-            "was not reconstructed",
-            f"run `mocap reconstruct {session}`",
-            code="nothing-reconstructed",
-        )
+        problem = "was not reconstructed"
+        raise DataError(session, problem, f"run `mocap reconstruct {session}`", code="nothing-reconstructed")
     return read_table(session / "reconstruct" / f"{name}.parquet", schema)

@@ -1,8 +1,7 @@
 """Stages over many flights, on Dask; this is the only module above the stages.
 
-A flight is one task. If a worker dies, the next one continues the flight where its stages stopped. Sessions
-are the same as those of single runs, byte for byte. A session at a URL is uploaded once, when its flight is
-done.
+A flight is one task. If a worker dies, the next one continues where its stages stopped. Sessions are the same
+as those of single runs, byte for byte.
 """
 
 import csv
@@ -110,13 +109,12 @@ def batch(
 ) -> Batch:
     """Run the stages over many flights, and write a summary.
 
-    A flight that fails does not stop the others. It still gets its report if it was ingested.
+    A flight that fails does not stop the others, and still gets its report if it was ingested.
 
     Args:
-        output: the folder of the sessions and the summary. By default sessions lie beside their manifests,
-            and the summary in `batch/` of the working directory.
-        workers: the number of processes on this machine, one flight each; by default one for each core. Not
-            used with `scheduler`. If there are fewer flights than workers, a flight gets several.
+        output: the folder of all; by default sessions lie beside manifests, and the summary
+            in `batch/` of the working directory.
+        workers: the number of processes on this machine, one flight each; by default one per core.
         scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
         overwrite: replace files that have the names of the summary's but are not of a batch.
 

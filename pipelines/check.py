@@ -1,8 +1,8 @@
 """Check a flight: what its description, its logs and its pictures cannot all be true of.
 
 A flight that was not ingested yet is read into a temporary session. Where no keypoints are known, the
-detector looks at a few seconds in the middle of the flight, in a temporary copy: a check changes no session.
-The backgrounds of these pictures are followed, too: only they tell that all cameras' clocks are alike wrong.
+detector looks at a few seconds in the middle, in a temporary copy, and the backgrounds are followed: only
+they tell that all cameras' clocks are alike wrong.
 """
 
 import difflib
@@ -61,15 +61,10 @@ def check(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Checked:
-    """Check a session, or a flight by its manifest.
+    """Check a session, or a flight by its manifest; the result does not depend on `workers`.
 
-    Args:
-        path: the folder of a session, or flight.yaml.
-        pose_noise: what is known of the poses' errors, instead of what flight.yaml says.
-        detector: looks at pictures without keypoints.
-        workers: the number of threads; the result does not depend on it.
-
-    DataError: the flight cannot be read, or nobody is seen.
+    `pose_noise` replaces that of flight.yaml; `detector` looks at pictures without keypoints. DataError: the
+    flight cannot be read, or nobody is seen.
     """
     progress = progress or Silent()
     return_freed_arrays()
@@ -91,25 +86,14 @@ def check(
 def fix(manifest: Path, **options: Any) -> tuple[Checked, list[str]]:
     """Check a flight, and write into its manifest the remedies with which it is doubted less.
 
-    The remedy of the first doubt is put into a copy beside the manifest, which is checked as a whole. It
-    is kept if its doubt is gone and no other appears; then comes that of the next first doubt.
-
-    Args:
-        manifest: flight.yaml.
-        options: those of `check`.
-
-    Returns:
-        The doubts that are left, and the lines of the difference; none where nothing was written.
-
-    DataError: the path is a session, or the flight cannot be read.
+    The remedy of the first doubt is put into a copy beside the manifest, which is checked as a whole. It is
+    kept if its doubt is gone and no other appears; then comes that of the next first doubt. Return the doubts
+    that are left, and the lines of the difference. DataError: the path is a session, or the flight cannot be
+    read.
     """
     if manifest.is_dir():
-        raise DataError(
-            manifest,
-            "is a session: remedies are written into its flight.yaml",
-            "check that file",
-            code="bad-option",
-        )
+        problem = "is a session: remedies are written into its flight.yaml"
+        raise DataError(manifest, problem, "check that file", code="bad-option")
     checked = check(manifest, **options)
     stated = text = manifest.read_text(encoding="utf-8")
     copy = manifest.with_name(f".{manifest.name}.tried")  # beside it, since paths are relative

@@ -1,13 +1,8 @@
 """Stages `detect` and `background`: people and background in the pictures.
 
-A keypoint detector looks at the pictures of every camera that has no imported keypoints. Points of the
-background are followed through those of every moving camera, and stills are kept.
-
 Pictures are taken in blocks of fixed length, so that blocks can be worked on side by side and an interrupted
-run continues with those that are missing; the result does not depend on either. People are followed from the
-start of each block. The background of a block begins with the last picture of the one before: its points are
-others, but that picture binds them. Tracks depend on the pictures alone, so they are kept while poses,
-clocks, keypoints and methods change.
+run continues with those that are missing; the result depends on neither. People are followed from the start
+of each block. The background of a block begins with the last picture of the one before, which binds them.
 
 Keypoints are kept as long as the pictures, the detector and the actor's log are the same. Other clocks change
 their times only. Other poses, clocks and calibrations also change where the actor is looked for, a little;
@@ -122,23 +117,16 @@ def detect(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> StageRecord | None:
-    """Detect keypoints for cameras without imported ones.
+    """Detect keypoints for cameras without imported ones, in a session that the caller has locked.
 
     Args:
-        session: locked by the caller.
         detector: a registered name, or a family's name, a colon and its argument.
         people: the number that is wanted; of one who was logged, the actor alone is followed.
-        every: use only every k-th picture.
-        start_s: use only pictures at or after this time, in seconds since the flight's first frame of any
-            camera, also of those with keypoints; by default from the first.
-        end_s: use only pictures before this time; by default to the last.
-        workers: the number of processes of this machine; the result does not depend on it.
-        force: run it again even if nothing changed.
-        executor: works on the blocks instead of these processes.
-        progress: receives the progress.
+        start_s: use only pictures at or after this time, in seconds since the flight's first frame.
+        end_s: use only pictures before this time.
+        executor: works on the blocks instead of `workers` processes; the result depends on neither.
 
-    Returns:
-        The record of the stage; None if every camera has imported keypoints.
+    Return the record of the stage; None if every camera has imported keypoints.
 
     DataError: the detector's files are missing, pictures are gone or not those that were ingested, a table of
     the session was changed, or nobody was found in any picture.
@@ -181,12 +169,8 @@ def detect(
     blocks = [block for name in media for block in work.blocks(name)]
     pictures = sum(work.pictures(block) for block in blocks)
     if not pictures:
-        raise DataError(
-            session.folder,
-            f"no picture lies {_span_words(start_s, end_s)}",
-            "look at `mocap info`, or leave it out",
-            code="no-overlap",
-        )
+        problem = f"no picture lies {_span_words(start_s, end_s)}"
+        raise DataError(session.folder, problem, "look at `mocap info`, or leave it out", code="no-overlap")
     progress.start("Detecting keypoints", pictures)
     workers = 1 if pictures < MIN_PICTURES_FOR_PROCESSES else workers
     folders = _detected(run, work, blocks, chosen, people == 1, workers, executor, progress)
@@ -417,12 +401,9 @@ def detect_block(order: _DetectionOrder) -> dict[str, bytes]:
     """
     folder = order.session.opened()
     if hashes_of_models(order.detector) != order.models:
-        raise DataError(
-            order.detector.name,
-            "has other model files on a machine of the Dask cluster, or none",
-            "every machine needs the same ones (see `mocap models`)",
-            code="wrong-worker",
-        )
+        problem = "has other model files on a machine of the Dask cluster, or none"
+        remedy = "every machine needs the same ones (see `mocap models`)"
+        raise DataError(order.detector.name, problem, remedy, code="wrong-worker")
     description = read_description(folder)
     work = _Work(folder, description, order.every, (None, None))
     hints = _Hints(folder, description, [order.block.camera], only_one=order.only_one)
@@ -609,16 +590,10 @@ def follow(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> StageRecord:
-    """Follow the backgrounds of all moving cameras with pictures.
+    """Follow the backgrounds of all moving cameras with pictures, in a session that the caller has locked.
 
-    Args:
-        session: locked by the caller.
-        every: the detector uses only every k-th picture; so is the background of cameras that it looks at.
-        span_s: times between which the detector looks at pictures, None for no bound.
-        workers: the number of processes of this machine; the result does not depend on it.
-        force: run it again even if nothing changed.
-        executor: works on the blocks instead of these processes.
-        progress: receives the progress.
+    `every` and `span_s` (None for no bound) are those of the detector; backgrounds of cameras that it looks
+    at use the same pictures. The rest as for `detect`.
 
     DataError: no moving camera has pictures, or these are gone or not those that were ingested.
     """
@@ -627,12 +602,8 @@ def follow(
     description = read_description(folder)
     names = cameras_to_follow(description)
     if not names:
-        raise DataError(
-            "the backgrounds",
-            "no moving camera has pictures to look at",
-            "state their `video`, or leave it out",
-            code="no-pictures",
-        )
+        problem, remedy = "no moving camera has pictures to look at", "state their `video`, or leave it out"
+        raise DataError("the backgrounds", problem, remedy, code="no-pictures")
     refuse_changed_pictures(folder, description, names)
     seen = {name: _blocks_to_follow(folder, description, name, every, span_s) for name in names}
     recorded = description.recorded

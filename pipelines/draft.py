@@ -140,12 +140,8 @@ def draft(
     """Examine files and folders and write the manifest of their flight.
 
     Folders are searched, without hidden files and sessions. Things that the files do not determine are in
-    comments of the manifest, beside the line that they concern.
-
-    Args:
-        output: the manifest; by default flight.yaml in the folder that all paths share.
-        overwrite: replace an existing file.
-        ask: decides what neither names nor contents do; without it, that is missing.
+    comments beside the line that they concern. By default it is flight.yaml in the folder that all paths
+    share. `ask` decides what neither names nor contents do; without it, that is missing.
 
     DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.
     """

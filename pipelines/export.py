@@ -95,20 +95,17 @@ def export(
     """Write a session in other formats, and `export.json` with a description of each file and its notes.
 
     No file gets its final name before everything is written. Files of an earlier export that are unchanged
-    since are replaced. Half-written files of a killed export are removed.
+    since are replaced; `overwrite` replaces other files, too.
 
     Args:
         output: the output folder; by default beside the session, with `.export` instead of `.session`.
         unit: of lengths, for formats that have a choice; by default that of each format.
         axes: z-up or y-up, for formats that have a choice; by default those of each format.
-        time: zero (the flight's first picture) or epoch (the session's own times), for formats in seconds
-            that have a choice; zero by default. `export.json` keeps the epoch of zero as `zero_ns`.
+        time: zero (the flight's first picture) or epoch (the session's own times), for formats with a choice.
         pictures_hz: pictures of each camera per second, for recordings that hold pictures; 0 is none.
-        overwrite: replace existing files that no export wrote, or that were changed since.
 
-    DataError: no such format, a format without a choice of unit, axes or time, nothing to export, tables or
-    pictures that were changed, or a file would be overwritten. BusyError: another process exports to the same
-    folder.
+    DataError: no such format or choice, nothing to export, tables or pictures that were changed, or a file
+    would be overwritten. BusyError: another process exports to the same folder.
     """
     progress = progress or Silent()
     exports = [find_export(name) for name in dict.fromkeys(formats)]

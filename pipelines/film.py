@@ -1,9 +1,7 @@
 """Stage `film`: rendered films of a comparison's arms, with a real detector on the pictures.
 
-Build the scenario's world and actor again; render what every camera of an arm would have seen; run the
-detector; reconstruct, and measure errors against the truth. The
-pictures are simulated, the detector is real. Which of several people a detection shows is taken from the
-truth. `replan` is only read.
+The scenario's world is built again, and what every camera would have seen is rendered, detected,
+reconstructed and measured against the truth, which also says whom a detection shows. `replan` is only read.
 """
 
 import shutil
@@ -115,11 +113,7 @@ def film(
     force: bool = False,
     progress: Progress | None = None,
 ) -> FilmResult:
-    """Film every arm of a session's comparison.
-
-    Args:
-        folder: the session; `replan` has run.
-        scenario: of the simulated flight; by default it is searched beside its pictures and the session.
+    """Film every arm of a session's comparison; the `scenario` of the flight is searched beside its pictures.
 
     DataError: nothing was compared yet, a table of the session was changed, the flight was not simulated, its
     scenario is missing or another flight's, the span holds fewer than two pictures, or the detector's files
@@ -232,12 +226,8 @@ def _scenario_of(folder: Path, description: Description) -> Path:
     for place in beside:
         if (place / SIMULATION_MARK).is_file() and (place / "scenario.yaml").is_file():
             return place / "scenario.yaml"
-    raise DataError(
-        folder,
-        "has no scenario.yaml of a simulated flight beside it",
-        "name it: --render HZ,scenario=SCENARIO.yaml",
-        code="no-such-file",
-    )
+    problem = "has no scenario.yaml of a simulated flight beside it"
+    raise DataError(folder, problem, "name it: --render HZ,scenario=SCENARIO.yaml", code="no-such-file")
 
 
 def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
@@ -254,11 +244,8 @@ def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
     hips = joints[:, [followed.person.joints.index(name) for name in _HIPS]].mean(axis=1)
     off_m = float(np.nanmax(np.linalg.norm(hips - flight.hips.position[:, 0, 0], axis=-1)))
     if not off_m <= MAX_HIPS_OFF_M:
-        raise DataError(
-            path,
-            f"is not this flight's: its actor is {off_m:.2f} m from the session's truth",
-            "name the flight's own: --render HZ,scenario=SCENARIO.yaml",
-        )
+        problem = f"is not this flight's: its actor is {off_m:.2f} m from the session's truth"
+        raise DataError(path, problem, "name the flight's own: --render HZ,scenario=SCENARIO.yaml")
     return setting
 
 
@@ -276,12 +263,8 @@ def _arm(
     t_ns = table["t_ns"].to_numpy(np.int64)[:: len(cameras)]
     rows = _rows(t_ns, settings)
     if len(rows) < 2:
-        raise DataError(
-            folder,
-            f"{len(rows)} pictures lie in the span that is to be filmed",
-            "widen it",
-            code="no-overlap",
-        )
+        problem = f"{len(rows)} pictures lie in the span that is to be filmed"
+        raise DataError(folder, problem, "widen it", code="no-overlap")
 
     moments = t_ns[rows]
     people = []

@@ -1,8 +1,7 @@
 """Stage `ingest`: read everything that `flight.yaml` names once, check it, and store it as one session.
 
-Frames get their world times here, poses their world axes, intrinsics the size of the pictures. Doubtful data
-are counted and reported. Unusable data are refused, with the file at fault. Each camera is a chunk of its
-own: an interrupted ingest continues with the cameras that it had not finished.
+Doubtful data are counted and reported, unusable data refused with the file at fault. Each camera is a chunk
+of its own: an interrupted ingest continues with the cameras that it had not finished.
 """
 
 import shutil
@@ -111,15 +110,13 @@ def ingest(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Ingested:
-    """Read a flight into a session.
+    """Read a flight into a session, by default `<name of the manifest>.session` beside it.
 
     Args:
-        session: the output folder; by default `<name of the manifest>.session` beside it.
         max_pose_gap_s: frames between two logged poses further apart than this have no pose.
         max_extrapolation_s: frames further than this before or after all logged poses have none.
         strict: refuse a flight if any part of it could not be read or used, or if its logs are doubted.
         overwrite: write also to a target that holds something else.
-        force: read everything again even if nothing changed.
 
     DataError: something cannot be used, or was changed while it was read; the session stays as it was.
     BusyError: another process writes the session.

@@ -1,9 +1,7 @@
 """Stage `reconstruct`: compute a skeleton, its status and its errors from keypoints in moving cameras.
 
-Detect people in the pictures and follow backgrounds where that was not done; find clocks; correct cameras by
-background and ground; associate people; triangulate; estimate jointly; measure the errors; doubt what cannot
-be right; store. Nothing is filled or smoothed without an option for it: a joint that could not be measured is
-NaN with a status that gives the reason.
+Nothing is filled or smoothed without an option for it: a joint that could not be measured is NaN with a
+status that gives the reason.
 """
 
 from __future__ import annotations
@@ -181,20 +179,11 @@ def reconstruct(
 ) -> Reconstructed:
     """Triangulate the people of a session, measure the errors, and doubt what cannot be right.
 
-    Args:
-        folder: the session.
-        settings: the settings that determine the result.
-        workers: the number of processes and threads; the result does not depend on it.
-        executor: works on the pictures and on windows of a long flight instead; neither does the result
-            depend on that.
-        force: run it again even if nothing changed, and the detection too.
-        progress: receives the progress.
+    The result depends neither on `workers`, the number of processes and threads, nor on an `executor` that
+    takes their place. `force` runs it again even if nothing changed, and the detection too.
 
-    Raises:
-        DataError: the session cannot be used, one of its tables or the pictures were changed, or nothing
-            could be reconstructed (the message gives the counts of the reasons, and the mistake that explains
-            them).
-        BusyError: another process writes the session.
+    DataError: the session cannot be used, one of its tables or the pictures were changed, or nothing could be
+    reconstructed (with the counts of the reasons). BusyError: another process writes the session.
     """
     settings = settings or ReconstructSettings()
     progress = progress or Silent()
@@ -296,12 +285,8 @@ def _detected(
         progress=progress,
     )
     if detected is None and (settings.start_s, settings.end_s) != (None, None):
-        raise DataError(
-            session.folder,
-            "every camera came with keypoints: no picture is looked at",
-            "leave the span out of --pictures",
-            code="no-pictures",
-        )
+        problem = "every camera came with keypoints: no picture is looked at"
+        raise DataError(session.folder, problem, "leave the span out of --pictures", code="no-pictures")
     unused = {
         "--pictures": settings.every > 1,
         "--detector": settings.detector != ReconstructSettings.detector,
@@ -336,12 +321,9 @@ def _hint_warnings(
 
 def _check_fill(fill_s: float | None) -> None:
     if fill_s is not None and not 0 < fill_s <= _LONGEST_FILL_S:
-        raise DataError(
-            "--smooth",
-            f"max_s: {fill_s:g} s is not between 0 and {_LONGEST_FILL_S:g} s",
-            "a longer gap is no measurement: leave it open",
-            code="bad-value",
-        )
+        problem = f"max_s: {fill_s:g} s is not between 0 and {_LONGEST_FILL_S:g} s"
+        remedy = "a longer gap is no measurement: leave it open"
+        raise DataError("--smooth", problem, remedy, code="bad-value")
 
 
 def _disturbance_warning(disturbance: PoseDisturbance) -> str:
@@ -503,11 +485,8 @@ def load_flight(
 ) -> LoadedFlight:
     """Load cameras, logged people, backgrounds, ground and truth of a session.
 
-    Args:
-        left_out: the reason why no backgrounds were followed.
-
-    Raises:
-        DataError: see `load_cameras`; a table or map of the session is damaged.
+    `left_out` is the reason why no backgrounds were followed. DataError as of `load_cameras`, or a damaged
+    table.
     """
     measured = measured_for(detected.settings["detector"]) if detected else None
     cameras, warnings = load_cameras(
@@ -583,11 +562,7 @@ class Attempt:
 
 
 def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Progress) -> Attempt:
-    """Find clocks, correct cameras by background and ground, triangulate, refine, and measure the errors.
-
-    Raises:
-        NoViewsError: no two cameras see anything at the same times.
-    """
+    """Do one trial; NoViewsError if no two cameras see anything at the same times."""
     description, settings = flight.description, flight.settings
     clocks, clock_sigma_s, made = clocks_of(flight, cameras)
     if clocks is not None:
@@ -682,13 +657,10 @@ def clocks_of(
 ) -> tuple[FoundClocks | None, Float, _Triangulated | None]:
     """Estimate unknown clock offsets, and question stated ones.
 
-    Returns:
-        The clocks, None where all are held; their prior standard deviations [C], s, for later steps; and what
-        was triangulated with clocks that all were held.
-
     A camera that turns has its clock from its background. The others are compared with these by the rays of
-    people, or with each other. An offset that all cameras share hardly changes these rays: if no camera's
-    start is stated and no background shows a clock by itself, it is estimated from all backgrounds together.
+    people, or with each other. An offset that all cameras share is estimated from all backgrounds together.
+    Return the clocks (None where all are held), their prior standard deviations [C], s, and what was
+    triangulated if all were held.
     """
     description, settings = flight.description, flight.settings
     prior_s, stated = load_clock_sigma(description, cameras)
@@ -792,7 +764,7 @@ def _robust_flight(
 def _clock_metrics(
     names: Sequence[str], clocks: FoundClocks | None, refined: RefinedFlight | None
 ) -> dict[str, Any]:
-    """Collect the clock offsets of all steps and their standard deviations; empty without unknown clocks."""
+    """Collect the clock offsets of all steps; empty without unknown clocks."""
     if clocks is None:
         return {}
     offset_s, sigma_s = clocks.offset_s, clocks.sigma_s
@@ -848,9 +820,8 @@ def find_people(
 ) -> tuple[Candidates, Association, Float]:
     """Collect all detections at common times, and associate them with people; those logged come first.
 
-    With a scene, things that are no people by the ground and by the other cameras are left out.
-
-    The last result is the uncertainty of rays, see `ray_sigma`.
+    With a scene, things that are no people by the ground and by the other cameras are left out. The last
+    result is the uncertainty of rays, see `ray_sigma`.
     """
     found = candidates(cameras, between)
     sigma = ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=PIXEL_SIGMA_PX)

@@ -1,8 +1,8 @@
 """Stage `replan`: fly the formation planners again, offline, with the logged actor and the maps.
 
-Load the logged flight; replay every arm and simulate what its cameras measure of the actor's skeleton; score
-all arms in the same way and compare; store. metrics.json marks what was simulated. The stage's folder holds
-the last comparison, and every one by its name in a folder of its own.
+Every arm is replayed, what its cameras measure of the actor's skeleton is simulated, and all are scored
+alike; metrics.json marks what was simulated. The stage's folder holds the last comparison, and every one by
+its name in a folder of its own.
 """
 
 from __future__ import annotations
@@ -182,12 +182,8 @@ def refuse_name(name: str | None) -> None:
     if name is None:
         return
     if not _NAME.fullmatch(name) or name.casefold().endswith(_ENDINGS):
-        raise DataError(
-            f"--name {name!r}",
-            "cannot be a folder",
-            "take letters, digits, points, - and _, without an ending",
-            code="not-a-folder",
-        )
+        problem, remedy = "cannot be a folder", "take letters, digits, points, - and _, without an ending"
+        raise DataError(f"--name {name!r}", problem, remedy, code="not-a-folder")
     if name.casefold() in {arm.casefold() for arm in (*PLANNER_ARMS.names(), *LOGGED)}:
         raise DataError(f"--name {name}", "is the name of an arm", "take another one", code="bad-option")
 
@@ -296,11 +292,8 @@ def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> 
             folder, "has no flight to compare with: its cameras stand still", f"leave {FLOWN} out"
         )
     if PLANNED in asked and not flight.planned:
-        raise DataError(
-            folder,
-            "holds no commands of a planner on board",
-            f"name them under `plan:`, or leave {PLANNED} out",
-        )
+        problem = "holds no commands of a planner on board"
+        raise DataError(folder, problem, f"name them under `plan:`, or leave {PLANNED} out")
     return list(dict.fromkeys(asked))
 
 

@@ -98,15 +98,12 @@ def report(
     force: bool = False,
     overwrite: bool = False,
 ) -> Reported:
-    """Write report/index.html of a session, or its page at `output`, if anything changed.
+    """Write report/index.html of a session, or its page at `output`, if anything changed (or by `force`).
 
-    Args:
-        studies: folders of `mocap study` that the page shows as well.
-        force: write it again even if nothing changed.
-        overwrite: replace a file that lies at `output` and is no page of mocap.
-
-    DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
-    study; the page cannot be written. BusyError: another process writes the session.
+    `studies` are folders of `mocap study` that the page shows as well; `overwrite` replaces a file at
+    `output` that is no page of mocap. DataError: not a session, or damaged; a table of it, or pictures, were
+    changed; a folder that holds no study; the page cannot be written. BusyError: another process writes the
+    session.
     """
     studied = [read_study(study) for study in studies]
     return_freed_arrays()
@@ -166,7 +163,7 @@ def compare_sessions(
     """Write the page that compares every session with the first, by default comparison/index.html beside it.
 
     DataError: not a session, damaged, changed by hand, stated twice, or the file exists and is no page of
-    mocap (see `overwrite`).
+    mocap.
     """
     resolved = [folder.resolve() for folder in folders]
     for folder, place in zip(folders, resolved, strict=True):
@@ -201,11 +198,10 @@ def write_figures_of(
 ) -> Reported:
     """Write the figures of a session's page, or of the page that compares several with the first, as files.
 
-    The files are PNG, SVG and PDF 180 mm wide, the numbers of each figure as CSV, and figures.json with
-    titles and captions. Figures that an earlier run wrote there are replaced; with `overwrite` also other
-    things, but never a session. DataError: not a session, or damaged; a table of it, or pictures, were
-    changed; the folder holds something else, or cannot be written. BusyError: another process writes the same
-    folder.
+    They are PNG, SVG and PDF, their numbers CSV, and figures.json has titles and captions. Figures of an
+    earlier run are replaced; with `overwrite` also other things, but never a session. DataError: not a
+    session, or damaged; a table of it, or pictures, were changed; the folder cannot be written. BusyError:
+    another process writes it.
     """
     try:
         refuse_foreign(target, overwrite=overwrite)

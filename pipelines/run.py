@@ -33,16 +33,9 @@ def run(
 ) -> Ran:
     """Draft the manifest of a folder if it has none, then ingest, reconstruct, replan and report the flight.
 
-    Planners are compared where the flight has a map and somebody who was logged. What is finished already
-    is skipped.
-
-    Args:
-        folder: the files of the flight, or its manifest.
-        ask: decides what no file tells (see `draft`).
-        workers: the number of processes; the result does not depend on it.
-
-    DataError: the folder holds no flight, something is missing that only the user knows, or a stage cannot do
-    its work.
+    Planners are compared where the flight has a map and somebody who was logged. What is finished is skipped.
+    `folder` may be the manifest, too; `ask` decides what no file tells (see `draft`). DataError: the folder
+    holds no flight, something is missing that only the user knows, or a stage cannot do its work.
     """
     progress = progress or Silent()
     manifest, assumed = drafted(folder, ask=ask, progress=progress)
@@ -70,10 +63,7 @@ def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[s
     found = draft([folder], manifest, ask=ask, progress=progress)
     progress.note(f"{manifest}: drafted, with {len(found.cameras)} cameras")
     if found.missing:
-        raise DataError(
-            manifest,
-            f"was drafted and lacks {'; '.join(map(one_line, found.missing))}",
-            "write it there, where a comment marks the place, and run the same command again",
-            code="incomplete",
-        )
+        problem = f"was drafted and lacks {'; '.join(map(one_line, found.missing))}"
+        remedy = "write it there, where a comment marks the place, and run the same command again"
+        raise DataError(manifest, problem, remedy, code="incomplete")
     return manifest, found.assumed

@@ -1,8 +1,4 @@
-"""Stage `simulate`: a flight with known truth, in the same files as those of a real flight.
-
-Read the scenario; fly it; write logs, calibration, map and truth; film it, or write keypoints with a
-detector's errors instead of videos; write a flight.yaml that names all of these files.
-"""
+"""Stage `simulate`: a flight with known truth, in the same files as those of a real flight."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -74,16 +70,12 @@ def simulate(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Simulated:
-    """Simulate a flight.
+    """Simulate a flight into a folder; an earlier simulation there is replaced if it holds no other files.
 
-    Args:
-        folder: the output folder; an earlier simulation there is replaced if it holds no other files.
-        video: render videos; else write keypoints with the errors of a detector instead.
-        workers: the number of blocks in parallel; logs, truth and pictures do not depend on it.
-        overwrite: replace a folder that is no simulation, or that holds other files as well.
-
-    DataError: the scenario cannot be used, or the folder cannot be written. BusyError: another process makes
-    the same folder.
+    Without `video`, keypoints with the errors of a detector are written instead. Logs, truth and pictures do
+    not depend on `workers`. `overwrite` replaces a folder that is no simulation, or holds other files as
+    well. DataError: the scenario cannot be used, or the folder cannot be written. BusyError: another process
+    makes it.
     """
     progress = progress or Silent()
     scenario = read_scenario(scenario_path)
@@ -135,12 +127,9 @@ def _refuse_to_lose_others(folder: Path) -> None:
         return  # whole_folder checks folders that are no simulation
     names = sorted(path.name for path in folder.iterdir())
     if others := [name for name in names if not any(fnmatch(name, own) for own in _OWN)]:
-        raise DataError(
-            folder,
-            f"holds more than an earlier flight ({len(others)} entries, the first {others[0]})",
-            "move that away, choose another place with --output, or replace all of it with --overwrite",
-            code="exists",
-        )
+        problem = f"holds more than an earlier flight ({len(others)} entries, the first {others[0]})"
+        remedy = "move that away, choose another place with --output, or replace all of it with --overwrite"
+        raise DataError(folder, problem, remedy, code="exists")
 
 
 def _key(scenario: Scenario, path: Path, video: bool) -> str:
@@ -177,11 +166,8 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
             place, f"no such planner {formation.planner!r}", f"there are {known}", code="no-such-name"
         )
     if formation.yaw_rate_deg_per_s or formation.variation:
-        raise DataError(
-            f"{path}: drones.formation",
-            f"yaw_rate_deg_per_s and variation are the ring's, {formation.planner} turns as it decides",
-            "leave them out, or take planner: ring",
-        )
+        problem = f"yaw_rate_deg_per_s and variation are the ring's, {formation.planner} turns as it decides"
+        raise DataError(f"{path}: drones.formation", problem, "leave them out, or take planner: ring")
     arm = PLANNER_ARMS.get(formation.planner)
     followed = next(iter(scenario.people.values()))
     stated = {

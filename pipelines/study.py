@@ -1,9 +1,8 @@
 """Stage `study`: how an error depends on what is varied, over a simulated walk or over a session.
 
 A study of a walk films a walking person from ideal positions, disturbs poses and keypoints in several trials,
-triangulates by every method, and computes errors on the joint-frames that all methods have. A study of a
-session flies planner arms against its log with other settings; every combination is one replay, with the same
-draws. Both write one folder: study.json, metrics.json, table.csv and a figure. All figures are simulated.
+and triangulates by every method; errors are on the joint-frames that all methods have. A study of a session
+flies planner arms against its log with other settings, with the same draws. All figures are simulated.
 """
 
 from __future__ import annotations
@@ -133,18 +132,13 @@ def study(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Studied:
-    """Run a study; conditions that an interrupted run finished are kept.
+    """Run a study; conditions that an interrupted run finished are kept, whatever `workers` is.
 
-    Args:
-        words: the variables with their values, as `values_of` reads them.
-        place: a session, or the scenario of the walk; None for a walk on a circle.
-        folder: the output folder; an earlier study there is replaced.
-        workers: the number of conditions of a walk in parallel; the results do not depend on it.
-        overwrite: replace a folder that is no study.
-
-    DataError: a variable or value is wrong, the folder cannot be written or is a session's, the session or
-    the scenario cannot be used, or nothing was reconstructed. BusyError: another process makes the same
-    folder, or writes the session.
+    `words` are the variables with their values, as `values_of` reads them; `place` a session, or the scenario
+    of the walk, None for a walk on a circle. An earlier study in the folder is replaced, with `overwrite`
+    anything. DataError: a variable or value is wrong, the folder cannot be written or is a session's, the
+    session or the scenario cannot be used, or nothing was reconstructed. BusyError: another process works
+    there.
     """
     progress = progress or Silent()
     stated = values_of(words)
@@ -253,12 +247,8 @@ def _study_walk(
         rows = [row for part in parts for row in read_json(part / "rows.json")["rows"]]
         cells = estimates(rows, settings.axis)
         if not any(cell["metrics"]["mpjpe_mm"] for cell in cells):
-            raise DataError(
-                "study",
-                "nothing was reconstructed by all methods",
-                "film longer, or at lower tilts",
-                code="nothing-reconstructed",
-            )
+            problem = "nothing was reconstructed by all methods"
+            raise DataError("study", problem, "film longer, or at lower tilts", code="nothing-reconstructed")
         noise = {each.label: each.model for each in settings.noise}
         metrics = {
             "kind": "walk",
@@ -411,12 +401,8 @@ def _replay_settings(stated: Stated) -> ReplanSettings:
     names = set(SETTINGS) - {"radius_m"}
     unknown = [name for name in stated if name not in {*_OF_SESSION, *names}]
     if unknown:
-        raise DataError(
-            unknown[0],
-            "is no variable of a study of a session",
-            f"there are {', '.join(_OF_SESSION)}, and the settings of the planner",
-            code="no-such-name",
-        )
+        remedy = f"there are {', '.join(_OF_SESSION)}, and the settings of the planner"
+        raise DataError(unknown[0], "is no variable of a study of a session", remedy, code="no-such-name")
     refuse_unknown(stated.get("arm", ()), logged=False)
     numbers(stated, "range_m", float, 0.5, 500)
     numbers(stated, "tilt_deg", float, -10, 85)

@@ -1,10 +1,8 @@
 """Records of what was found in files: candidates for the parts of a manifest, and the topics of logs.
 
-Labels tell files and topics of the same camera.
-
-A name is split into words with their numbers (drone_1_poses: drone 1, poses). Words for the kind of a thing
-(poses, camera, json) are ignored; the rest is its label. `drone1.mp4`, `drone1_poses.tum`,
-`/drone1/odometry` and `drone-01/calib.yaml` all have the label drone 1.
+A name is split into words with their numbers. Words for the kind of a thing (poses, camera, json) are
+ignored; the rest is its label: `drone1.mp4`, `drone1_poses.tum` and `drone-01/calib.yaml` have the label
+drone 1.
 """
 
 from __future__ import annotations
@@ -427,7 +425,7 @@ def choose_stamps(recordings: Sequence[FoundLog]) -> list[FoundLog]:
     """Choose one kind of stamps for all logs; with it, the spans are those of these stamps.
 
     Header stamps are taken, unless they differ from those of receipt by more than a log is long (simulation
-    time, time since boot) and are not alike in all topics of all logs: then only the receipt is one clock.
+    time, time since boot) and are not alike in all topics of all logs.
     """
     once = {"intrinsics", "map"}  # published once, perhaps long before
     moving = [
@@ -464,8 +462,8 @@ def choose_stamps(recordings: Sequence[FoundLog]) -> list[FoundLog]:
 def chains(edges: Sequence[FoundLink]) -> list[tuple[str, str, int]]:
     """List (parent, child) of every moving camera or body frame of a log's transforms; cameras first.
 
-    The third is the time (ns) from which all transforms between them are known. The parent is the root of
-    the child's tree. Frames that are fixed to the root are left out.
+    The third is the time (ns) from which all transforms between them are known. The parent is the tree's
+    root.
     """
     above: dict[str, FoundLink] = {}
     for edge in edges:

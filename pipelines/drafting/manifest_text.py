@@ -1,8 +1,7 @@
 """Text of a drafted flight.yaml: what was found, with comments on what only the user can know.
 
-The keys, their order and the words on missing ones are those of the manifest's models. Names come from
-file systems and logs, and may hold any character. A value is always read back as the same, and a comment
-always ends at the end of its line.
+Keys, their order and the words on missing ones are those of the manifest's models. Names may hold any
+character: a value is always read back as the same, and a comment always ends at the end of its line.
 """
 
 from __future__ import annotations
@@ -526,13 +525,7 @@ def _first_frame(listed: FoundFrames, film: FoundFilm | None) -> int:
 
 
 def write_manifest(draft: FlightDraft, name: str, relative: Callable[[Path], str]) -> ManifestText:
-    """Write the whole manifest of a draft.
-
-    Args:
-        draft: the flight with its cameras and sources.
-        name: of the flight.
-        relative: converts a path to the form in the manifest.
-    """
+    """Write the whole manifest of a draft; `relative` converts a path to the form in the manifest."""
     writer = _ManifestWriter(draft, relative)
     lines = [_HEAD, *DraftedKey(SCHEMA).lines("schema", None), *DraftedKey(name).lines("name", None)]
     lines += writer.world().lines("world", None)

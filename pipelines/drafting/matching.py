@@ -1,8 +1,8 @@
 """Matching of pictures, poses, calibrations and truth to cameras.
 
-A camera is anything with pictures: a video, keypoints, a topic with pictures. Every other candidate goes to
-the camera with the same name. If there are several for a camera, the one that overlaps in time with its film
-is taken, then the one of the likelier kind. The others are kept and listed as alternatives.
+A camera is anything with pictures or keypoints. Every other candidate goes to the camera with the same name;
+of several the one that overlaps in time with its film is taken, then the one of the likelier kind. The others
+are listed as alternatives.
 """
 
 from __future__ import annotations
@@ -159,12 +159,8 @@ def match(
 ) -> FlightDraft:
     """Find the cameras, and what belongs to each.
 
-    Args:
-        found: candidates in files.
-        recordings: logs of topics.
-        compare: decides where neither names nor times do.
-        distance: decides between logs of one time, for cameras whose own positions lack attitudes.
-        ask: decides what nothing else does.
+    `compare` decides where neither names nor times do, `distance` between logs of one time, for cameras whose
+    own positions lack attitudes, and `ask` what nothing else does.
     """
     logs = choose_stamps(join_parts(recordings))
     every = [*found, *(candidate for log in logs for candidate in log.candidates())]
@@ -336,10 +332,9 @@ def _pair_by_content(
     intrinsics: Sequence[Proposal],
     compare: Compare,
 ) -> None:
-    """Give videos without poses those that no camera has: by time, else by motion.
+    """Give videos without poses those that no camera has, by time, else by motion.
 
-    What a log has of the same name as the poses is then the camera's too. Motion also tells when a
-    video began, and what the angles of a gimbal are relative to.
+    Motion also tells when the video began.
     """
     taken = _taken(cameras)
     likeliest: dict[object, Proposal] = {}  # of several topics of one drone

@@ -1,9 +1,8 @@
 """Agreement of a video with a camera's logged poses, by the motion of points in its pictures.
 
-Between two pictures a point moves along a line that the camera's motion determines (epipolar geometry,
-Hartley and Zisserman 2004, section 9.1). Only its place on the line depends on its depth. So poses can be
-judged without knowing the scene: by the distance of points from the segment of that line between infinite
-depth and the nearest possible depth. If the camera only turns, the segment is a point.
+Between two pictures a point moves along a line that the camera's motion determines (Hartley and Zisserman
+2004, section 9.1). So poses are judged without knowing the scene: by the distance of points from the segment
+of that line between infinite depth and the nearest possible depth.
 """
 
 from dataclasses import dataclass, replace
@@ -63,13 +62,8 @@ def explain_motion(
     """Compute how well a camera's poses explain the motion of points, at the start that fits best.
 
     Return the log-likelihood gain of each stretch [S] over a camera that stands still, and the start on the
-    log's clock, ns.
-
-    Starts are compared by the likelihood of the points' distances (Cauchy's, so that the filmed person and
-    lost points have little weight). Of several cameras' poses, those that explain a video clearly better than
-    all others are its own (`explains_better`), even with a calibration that is only nearly right. The stamps
-    `t_ns` [N] strictly increase; poses further apart than `max_gap_ns` are not interpolated. None if the
-    poses cover less than half of the points, or there are none.
+    log's clock, ns. Distances have Cauchy's likelihood, so that the filmed person and lost points have little
+    weight. The stamps [N] strictly increase. None if the poses cover less than half of the points.
     """
     if not len(followed.stretch) or len(t_ns) < 2:
         return None

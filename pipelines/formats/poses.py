@@ -1,8 +1,7 @@
 """Trajectories as text: TUM, CSV with a heading, and AirSim's recording.
 
-TUM: `t x y z qx qy qz qw`, one pose per line, t in seconds (TUM RGB-D benchmark). Some writers keep the
-layout but change the order. They name it in a line above the numbers, such as
-`# timestamp tx ty tz qw qx qy qz`.
+TUM: `t x y z qx qy qz qw`, t in seconds; a line above the numbers may name another order, as `# timestamp tx
+ty tz qw qx qy qz`.
 """
 
 from __future__ import annotations
@@ -56,8 +55,7 @@ FARTHEST_M = 1e9
 def find_poses(text: str) -> tuple[Heading, dict[str, int]] | None:
     """Find the heading of a table of poses, and the columns x, y, z, qx, qy, qz, qw and any of c00..c55.
 
-    It is the first line that is no comment. It may also be a comment whose cells are separated by more than
-    spaces (`#timestamp [ns],p_RS_R_x [m],...`). Comments of TUM files, with spaces only, do not count.
+    It is the first line that is no comment, or a comment whose cells are separated by more than spaces.
     """
     for index, line in enumerate(text.split("\n", 100)[:100]):
         stripped = line.strip()
@@ -98,12 +96,10 @@ def clean_poses(
 ) -> Trajectory:
     """Drop the rows of [N] poses that cannot be used, each counted under the first cause that applies.
 
-    - "truncated last line": rows that the reader already left out at the end (`truncated`);
-    - "not finite": a stamp or a number that is missing, NaN or infinite. A covariance [6, 6] that is blank
-      as a whole is unknown (all zero) and keeps its row;
-    - "zero quaternion", "quaternion not unit" (off by more than NORM_TOLERANCE; others are normalised);
-    - "absurd position": further from the origin than FARTHEST_M;
-    - "duplicate stamp", "stamp out of order" as in `kept_rows`.
+    "truncated last line" (`truncated` rows that the reader left out); "not finite" (a covariance [6, 6] that
+    is blank as a whole is unknown, all zero, and keeps its row); "zero quaternion"; "quaternion not unit"
+    (off by more than NORM_TOLERANCE; others are normalised); "absurd position" (beyond FARTHEST_M); as in
+    `kept_rows`.
     """
     if covariance is not None:
         blank: Bool = np.asarray(np.isnan(covariance).all(axis=(1, 2)))
@@ -269,9 +265,9 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 class TumExport:
     """Writer of one file for each camera and for each joint, in metres, z up, stamps with nine decimals.
 
-    `<name>_<camera>.tum` is world_from_camera as logged, `<name>_<camera>_refined.tum` as corrected by the
-    reconstruction. `<name>_<joint>.tum` (with several people `<name>_<person>_<joint>.tum`) is a joint with
-    the identity as rotation (0 0 0 1). A time at which a joint is missing has no row.
+    `<name>_<camera>.tum` is world_from_camera as logged, `<name>_<camera>_refined.tum` as corrected,
+    `<name>_<joint>.tum` (with several people `<name>_<person>_<joint>.tum`) a joint with the identity as
+    rotation. A time at which a joint is missing has no row.
     """
 
     name = "tum"
@@ -325,9 +321,9 @@ def _is_csv(head: str) -> bool:
 def _read_csv(path: Path) -> Trajectory:
     """Read every pose below a heading of any order, separated by commas, semicolons or tabs.
 
-    Needed: a time (t_ns, or t, time, timestamp, stamp in seconds or with a unit), x y z
-    (also tx, p_x, pos_x, position_x), qx qy qz qw (also q_x, orientation_x, q_RS_x). Optional: the covariance
-    c00..c55, upper triangle, position in world and rotation vector in body. Other columns are ignored.
+    Needed: a time (`stamp_column`), x y z (also tx, p_x, pos_x, position_x), qx qy qz qw (also q_x,
+    orientation_x, q_RS_x). Optional: the covariance c00..c55, upper triangle, position in world and rotation
+    vector in body.
     """
     text = read_text(path)
     found = find_poses(text)

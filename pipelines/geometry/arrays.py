@@ -32,9 +32,8 @@ class Intrinsics:
 
     `radtan` is OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]], `fisheye` is OpenCV's k1 k2 k3 k4 (equidistant).
     The centre of the top left pixel is (0, 0). `readout_s` is the time a rolling shutter takes from the first
-    (top) to the last row, 0 for a global shutter or when unknown; a picture's stamp is its middle row's.
-    ValueError: sizes or focal lengths that are not positive, numbers that are not finite, an unknown model or
-    a number of coefficients that the model does not have; all problems in one message.
+    to the last row; a picture's stamp is its middle row's. ValueError names all that is wrong with the
+    numbers.
     """
 
     width: int

@@ -21,18 +21,10 @@ def camera_matrix(intrinsics: Intrinsics) -> Float:
 
 
 def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
-    """Project points in the camera's frame to pixels.
+    """Project points [..., 3] m in the camera's frame to pixels [..., 2], also outside the picture.
 
-    Pixels outside the picture are returned as well. Where the distortion polynomial has folded back on
-    itself, OpenCV returns the pixel of the fold's other branch. Here such points have no pixel, so that
-    `undistort` is the exact inverse.
-
-    Args:
-        points_camera: [..., 3] m, x right, y down, z forward.
-
-    Returns:
-        [..., 2] px; NaN for points that are NaN, behind the camera (z <= 0) or outside the model's
-        valid radius.
+    NaN for points that are NaN, behind the camera (z <= 0) or beyond the radius where the distortion folds
+    back on itself (OpenCV returns a pixel there), so that `undistort` is the exact inverse.
     """
     depth = np.where(points_camera[..., 2] > 0, points_camera[..., 2], np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -44,14 +36,9 @@ def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
 
 
 def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
-    """Compute the viewing ray of each pixel, as x/z and y/z.
+    """Compute the viewing rays x/z, y/z [..., 2] of pixels [..., 2], to 1e-10 (relative above 1).
 
-    Args:
-        pixels: [..., 2] px.
-
-    Returns:
-        [..., 2] normalised coordinates, solved to 1e-10 (relative above 1); NaN for pixels that are NaN
-        or that no ray within the model's valid radius reaches.
+    NaN for pixels that are NaN or that no ray within the model's valid radius reaches.
     """
     distorted = (pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
     flat = distorted.reshape(-1, 2)
@@ -65,11 +52,7 @@ def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
 def row_delay_s(row_px: Float, intrinsics: Intrinsics) -> Float:
     """Compute how much later than the picture's stamp, its middle row's, a rolling shutter takes a row.
 
-    Args:
-        row_px: [...] px from the centre of the first row, which is read first; NaN stays.
-
-    Returns:
-        [...] s, from -readout_s / 2 in the first row to readout_s / 2 in the last and on beyond them.
+    `row_px` [...] counts from the centre of the first row, which is read first; NaN stays.
     """
     delay: Float = (row_px / max(intrinsics.height - 1, 1) - 0.5) * intrinsics.readout_s
     return delay
@@ -78,8 +61,7 @@ def row_delay_s(row_px: Float, intrinsics: Intrinsics) -> Float:
 def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
     """Return the intrinsics for pictures resized to `width` x `height`.
 
-    The corners of the picture stay corners. They lie half a pixel outside the centres of the corner pixels,
-    so the principal point is not just multiplied by the factor (as in OpenCV's resize).
+    The corners of the picture stay corners: they lie half a pixel outside the centres of the corner pixels.
     """
     sx, sy = width / intrinsics.width, height / intrinsics.height
     return replace(
@@ -102,24 +84,12 @@ def is_resized(intrinsics: Intrinsics, width: int, height: int) -> bool:
 def fit_to_size(
     intrinsics: Intrinsics, width: int, height: int, bars: tuple[int, int, int, int] = (0, 0, 0, 0)
 ) -> tuple[Intrinsics, str | None]:
-    """Adapt intrinsics to the size of the pictures, which may differ from that of the calibration.
+    """Adapt intrinsics to the size of the pictures; return them, and a note if the sizes differ.
 
-    The same shape at another size (`is_resized`) means a resized picture: the intrinsics are rescaled.
-    Another shape, of which the part between black bars has the calibration's shape, means a picture that was
-    resized to fit between them: the intrinsics are rescaled to that part and moved to its corner. Another
-    shape without such bars, with both sides within 2 %, means a picture that its codec cropped or padded: the
-    intrinsics are kept.
-
-    Args:
-        intrinsics: the calibration.
-        height: of the pictures, px.
-        bars: black columns at the left, rows at the top, columns at the right, rows at the bottom, px. They
-            are whole pixels, so each side of the part between them is known to a pixel.
-
-    Returns:
-        The intrinsics to use, and a note if the sizes differ.
-
-    ValueError: the sizes differ by more than that.
+    The same shape at another size (`is_resized`) means a resized picture. Another shape, of which the part
+    between black `bars` (columns left, rows above, columns right, rows below, each whole pixels) has the
+    calibration's shape, means a letterboxed one. Another shape without bars, with both sides within 2 %,
+    means that a codec cropped or padded it: the intrinsics are kept. ValueError: the sizes differ by more.
     """
     if (width, height) == (intrinsics.width, intrinsics.height):
         return intrinsics, None

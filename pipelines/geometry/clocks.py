@@ -19,15 +19,11 @@ _DELAY_CORRELATION_S = 10.0
 
 
 def fit_clock(this_ns: Int64, other_ns: Int64) -> ClockFit | None:
-    """Fit a line between the readings of two clocks; return None for fewer than two events.
+    """Fit a line between the readings [N] of two clocks; return None for fewer than two events.
 
     The first slope is the median of the slopes between pairs (Theil 1950 and Sen 1968). Least squares without
-    the events far from that line then gives the drift. A drift that is not significant (within four of its
-    standard deviations of 0) is set to 0, because in short logs the delays of a link look like a drift.
-
-    Args:
-        this_ns: [N] readings of the one clock, in any order.
-        other_ns: [N] readings of the other at the same events.
+    the events far from that line then gives the drift. One within four of its standard deviations is set to
+    0, because in short logs the delays of a link look like a drift.
     """
     if len(this_ns) < 2:
         return None
@@ -127,12 +123,7 @@ class ClockStep:
 
 
 def find_steps(header_ns: Int64, receive_ns: Int64) -> list[ClockStep]:
-    """Find the steps of a header clock; jitter, drift and bursts of delayed messages are none.
-
-    Args:
-        header_ns: [N] stamps of the headers; 0 without one.
-        receive_ns: [N] stamps of receipt, in order.
-    """
+    """Find the steps of a header clock (stamps [N], 0: none); jitter, drift and bursts of delays are none."""
     (stamped,) = np.nonzero(header_ns)
     if len(stamped) < 2 * _MIN_MESSAGES:
         return []
@@ -226,14 +217,9 @@ def find_gaps(stamps_ns: Int64) -> list[StampGap]:
 def time_passed(t_ns: Int64, values: Float, gap: StampGap, at: int) -> bool | None:
     """Test by motion if the time of a gap passed; False if its clock stepped, None if motion does not tell.
 
-    The mean of the velocities before and after says how far the body moves in the usual interval, and in the
-    whole gap.
-
-    Args:
-        t_ns: [N] stamps.
-        values: [N, D] positions in m, or quaternions of continuous sign.
-        gap: the gap.
-        at: the row of the first message after it.
+    `values` [N, D] are positions in m, or quaternions of continuous sign; `at` is the row of the first
+    message after the gap. The mean velocities before and after say how far the body moves in the usual
+    interval, and in the whole gap.
     """
     t_s = (t_ns - t_ns[at]) / 1e9
     count = max(_MIN_MESSAGES, int(_VELOCITY_S / max(gap.usual_s, 1e-3)))

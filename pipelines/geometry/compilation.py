@@ -1,11 +1,8 @@
 """Compilation of numerical functions with numba, with a cache on disk; a lost or bad cache is no error.
 
-numba puts its cache beside the source, else in the user's cache folder, or in NUMBA_CACHE_DIR; where none of
-them can be written, this module puts it among temporary files. numba compiles again if the file of the
-outermost function changed. With this module, it does so also if the file of a
-helper changed, and it compares what the files contain, not their age. The first compilation of a process is
-logged, because it takes seconds. Of several processes that start together one compiles, and the others wait
-for what it writes into the cache.
+Where numba's own places for its cache cannot be written, it lies among temporary files. A function is
+compiled again also if the file of a helper changed in its contents. The first compilation of a process is
+logged, because it takes seconds. Of several processes that start together one compiles, and the others wait.
 """
 
 import hashlib
@@ -55,9 +52,8 @@ def helper(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Compile at the first call, release the interpreter while running, keep the code for the next process.
 
-    numba's cache raises an error if it cannot be written (`RuntimeError` when decorating) or read (a file cut
-    short by a full disk, or of an earlier version with types in other modules). In these cases the function
-    is compiled for this process only, and an unreadable cache is emptied for the next process.
+    Where numba's cache cannot be written or read, the function is compiled for this process only, and an
+    unreadable cache is emptied for the next one.
     """
     options = {"nogil": True, **_OPTIONS}
     try:

@@ -1,9 +1,8 @@
 """Gait events of walking people, and what follows from them: cadence, step length, speed.
 
-Events are those of Zeni, Richards and Higginson 2008 ("Two simple methods for determining gait events during
-treadmill and overground walking using kinematic data", Gait and Posture 27:710), their coordinate method: a
+Events are those of Zeni, Richards and Higginson 2008 (Gait and Posture 27:710), their coordinate method: a
 heel strikes when it is furthest ahead of the pelvis, and toes leave the ground when they are furthest behind
-it, along the direction of progression. Where a skeleton has no heels and toes, its ankles replace them.
+it. Where a skeleton has no heels and toes, its ankles replace them.
 """
 
 from __future__ import annotations
@@ -51,11 +50,8 @@ class GaitEvents:
 def gait_events(joints: Sequence[str], t_ns: Int64, position: Float) -> GaitEvents | None:
     """Find heel strikes and toe-offs while a person walks; None if they walk for less than two steps.
 
-    Args:
-        joints: the J joints by the names of `session.skeletons`.
-        t_ns: [T] strictly increasing.
-        position: [T, J, 3] m, z up; NaN is missing. Nothing is found in runs of frames shorter than a second
-            in which hips, feet and toes are all known.
+    `position` [T, J, 3] m, z up, at strictly increasing `t_ns` [T]; nothing is found in runs of frames
+    shorter than a second in which hips, feet and toes are all known.
     """
     needed = ("left_hip", "right_hip", "left_ankle", "right_ankle")
     if len(t_ns) < 2 or not set(needed).issubset(joints):
@@ -73,13 +69,7 @@ def gait_events(joints: Sequence[str], t_ns: Int64, position: Float) -> GaitEven
 
 
 def summary(events: GaitEvents, t_ns: Int64, joints: Sequence[str]) -> dict[str, object]:
-    """Summarise a person's gait: figures of `metrics.json`.
-
-    Args:
-        events: of one person.
-        t_ns: [T] the person's times.
-        joints: those of the skeleton.
-    """
+    """Summarise the events of one person: figures of `metrics.json`."""
     steps = np.isfinite(events.step_s)
     lengths = {
         f"{side}_step_m": _mean_sd(events.step_m[steps & (events.side == index)])

@@ -1,12 +1,8 @@
 """Conversion of latitude, longitude and height to metres east, north and up of a place (WGS84).
 
-By way of earth-centred, earth-fixed coordinates (ECEF: x to the meridian of Greenwich, z to the north
-pole), in closed form: exact at any distance, where "metres per degree" is off by 0.1 % within some
-kilometres. Formulas: IOGP Guidance Note 7-2 (EPSG methods 9602 and 9837), whose worked examples the tests
-repeat. NaN in gives NaN out.
-
-Heights are metres above the ellipsoid. Heights above sea level may be given where all are: they move
-everything up or down together, and stretch horizontal distances by less than 2e-5.
+By earth-centred, earth-fixed coordinates, in closed form. Formulas: IOGP Guidance Note 7-2 (EPSG methods 9602
+and 9837). Heights are metres above the ellipsoid; heights above sea level, where all are, stretch horizontal
+distances by less than 2e-5. NaN in gives NaN out.
 """
 
 import numpy as np
@@ -36,8 +32,7 @@ def ecef_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Fl
 def geodetic_from_ecef(from_centre: Float) -> tuple[Float, Float, Float]:
     """Compute latitude and longitude in degrees and height in metres of earth-centred points [..., 3].
 
-    Bowring 1976, one step: below 10 km of height its error is less than a micrometre. At the poles
-    themselves the height is that along the axis.
+    Bowring 1976, one step: below 10 km of height its error is less than a micrometre.
     """
     x, y, z = np.moveaxis(from_centre, -1, 0)
     from_axis = np.hypot(x, y)
@@ -73,12 +68,7 @@ def enu_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Flo
 
 
 def enu_from_enu(of: Place, origin: Place) -> tuple[Float, Float]:
-    """Compute the transform of metres east, north and up of one place to those of another.
-
-    Returns:
-        The rotation [3, 3] (north is not the same direction at both, nor is up) and the position [3] m of
-        the first in the second.
-    """
+    """Compute the rotation [3, 3] and position [3] m of one place's axes in those of another."""
     axes = _enu_axes(origin)
     return axes @ _enu_axes(of).T, axes @ (_ecef_of(of) - _ecef_of(origin))
 

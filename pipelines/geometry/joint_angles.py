@@ -3,18 +3,13 @@
 Names and axes follow the International Society of Biomechanics: hip, ankle and spine Wu et al. 2002 (Journal
 of Biomechanics 35:543), shoulder and elbow Wu et al. 2005 (38:981), the knee and the order of flexion,
 adduction and rotation Grood and Suntay 1983 (Journal of Biomechanical Engineering 105:136). In every body
-frame x is forward, y up and z to the person's right; left limbs are mirrored, so that a sign means the same
-on both sides. Signs are the clinical ones of `ANGLES`.
+frame x is forward, y up and z to the person's right; left limbs are mirrored. Signs are those of `ANGLES`.
 
-Centres of joints show less than the bony landmarks of these papers, which has four consequences:
-
-* Two hips do not show how the pelvis tilts. The hip's flexion is that of the thigh against the line from the
-  middle of the hips to the middle of the shoulders; so is the axis of the thorax.
-* The axis of a hinge (knee, elbow) is the normal of the plane of its two segments. It is unknown while the
-  limb is straight: rotations of thigh and upper arm are then `undetermined`.
-* Next to straight, the knee's axis is drawn towards the line of the hips, so that noise does not bend the
-  knee. The elbow has no such line: its flexion cannot be negative, and noise bends a straight elbow.
-* Nothing shows the pronation of the forearm. It is always `undetermined`.
+Centres of joints show less than the bony landmarks of these papers. Two hips do not show how the pelvis
+tilts: flexion of the hip is against the line from the middle of the hips to that of the shoulders. The axis
+of a hinge is the normal of the plane of its two segments, unknown while the limb is straight; next to
+straight, the knee's is drawn towards the line of the hips, so that noise does not bend it. The elbow's
+flexion cannot be negative. Pronation of the forearm is never shown.
 """
 
 from __future__ import annotations
@@ -93,17 +88,11 @@ def joint_angles(
     covariance: Float | None = None,
     status: NDArray[np.int8] | None = None,
 ) -> JointAngles:
-    """Compute every angle with its standard deviation and its status.
+    """Compute every angle of `position` [T, P, J, 3] m, z up, with its standard deviation and its status.
 
-    The standard deviation is of first order in the covariances of the joints, which are taken as independent
-    of each other; derivatives are differences over a micrometre.
-
-    Args:
-        joints: the J joints of a skeleton, by the names of `session.skeletons`.
-        position: [T, P, J, 3] m, z up; NaN is missing.
-        covariance: [T, P, J, 6] m^2, upper triangles; None if unknown.
-        status: [T, P, J] indices of `triangulation.STATUS`; by default ok where there is a position, else
-            not_detected.
+    The standard deviation is of first order in `covariance` [T, P, J, 6] m^2 (upper triangles; None if
+    unknown), independent between joints; derivatives are differences over a micrometre. `status` are indices
+    of `triangulation.STATUS`; by default ok where there is a position, else not_detected.
     """
     times, people = position.shape[:2]
     if status is None:

@@ -1,8 +1,8 @@
 """Errors of a skeleton against the truth, and measures of its plausibility without truth.
 
-Positions are [T, P, J, 3] in metres: time, person, joint; NaN is missing. A joint-frame is one joint of one
-person at one time, a person-frame one person at one time. Means run over joint-frames, each with the
-same weight.
+Positions are [T, P, J, 3] in metres, NaN is missing; stamps [T] strictly increase. A joint-frame is one joint
+of one person at one time, a person-frame one person at one time. Means run over joint-frames. ValueError:
+shapes disagree, or stamps do not increase.
 """
 
 from __future__ import annotations
@@ -47,20 +47,11 @@ WORLD_ERRORS = (
 class JointErrors:
     """The errors of a set of joints against the truth; NaN where nothing could be measured.
 
-    Attributes:
-        joint_frames: joint-frames that have truth.
-        reconstructed_share: share of these that were reconstructed, 0..1.
-        mpjpe_mm: mean distance, absolute.
-        root_mpjpe_mm: mean distance after both skeletons are moved to their root; the joint that is the
-            root itself is left out, because its distance is 0 by construction.
-        pa_mpjpe_mm: mean distance after a similarity per person-frame (Procrustes).
-        e_recon_m2: sum of squared distances (the objective of the reconstruction).
-        e_recon_terms: the joint-frames in that sum.
-        e_recon_per_joint_frame_m2: the sum divided by its terms.
-        pck150: share of the joint-frames with truth that are within 150 mm, 0..1; missing joints are wrong.
-        pck150_auc: mean of that share over every threshold from 0 to 150 mm.
-        acceleration_error_mm_s2: mean length of the difference between the accelerations, over three
-            consecutive samples that are all present.
+    `reconstructed_share` is that of the `joint_frames` with truth; `mpjpe_mm` the mean distance, `root_`
+    after both skeletons are moved to their root (without the root itself), `pa_` after a similarity per
+    person-frame (Procrustes); `e_recon_m2` the sum of `e_recon_terms` squared distances; `pck150` the share
+    within 150 mm, missing joints are wrong, `pck150_auc` its mean over thresholds from 0;
+    `acceleration_error_mm_s2` the mean length of the difference, over three consecutive samples.
     """
 
     joint_frames: int
@@ -77,21 +68,12 @@ class JointErrors:
 
 
 def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> dict[str, object]:
-    """Compute every error of an estimate against the truth, over all joints and per joint.
+    """Compute every error of an estimate against the truth, over all joints and per joint, as JSON.
 
-    Args:
-        estimate: [T, P, J, 3] m.
-        truth: [T, P, J, 3] m, the same people and joints at the same times.
-        joints: the J names; the root is `hip`, or the middle of `left_hip` and `right_hip`.
-        t_ns: [T] strictly increasing stamps.
-
-    Returns:
-        JSON-able: the fields of `JointErrors` (null for what could not be measured),
-        `root_frames_left_out` (person-frames with common joints but without a root on both sides),
-        `pa_frames_left_out` (person-frames whose common joints are fewer than 3 or lie on a line) and
-        `per_joint`: name to the same fields.
-
-    ValueError: the shapes disagree, or the stamps do not increase strictly.
+    The root is `hip`, or the middle of `left_hip` and `right_hip`. The result has the fields of `JointErrors`
+    (null for what could not be measured), `root_frames_left_out` (person-frames with common joints but
+    without a root on both sides), `pa_frames_left_out` (those with fewer than 3 common joints, or on a line)
+    and `per_joint`.
     """
     distances = _distances(estimate, truth, joints, t_ns)
     shared = np.isfinite(distances.absolute).any(axis=-1)
@@ -110,20 +92,11 @@ def world_errors(
 ) -> dict[str, float | None]:
     """Compute the errors in the world by their names in the field (Shin et al., WHAM, CVPR 2024).
 
-    Args:
-        estimate: [T, P, J, 3] m.
-        truth: [T, P, J, 3] m, the same people and joints at the same times.
-        joints: the J names.
-        t_ns: [T] strictly increasing stamps.
-
-    Returns:
-        `w_mpjpe_mm` and `wa_mpjpe_mm`: MPJPE in segments of 100 samples after the similarity of their first
-        two samples, and of the whole segment; `rte_percent`: distance of the roots after one rigid motion,
-        over the length of their true way; `jitter`: mean third derivative of the estimate, 10 m/s^3;
-        `foot_sliding_mm`: motion of standing feet in 1/30 s; `shifted_mpjpe_mm`: MPJPE after one shift of the
-        whole flight. None for what could not be measured.
-
-    ValueError: the shapes disagree, or the stamps do not increase strictly.
+    `w_mpjpe_mm` and `wa_mpjpe_mm`: MPJPE in segments of 100 samples after the similarity of their first two
+    samples, and of the whole segment; `rte_percent`: distance of the roots after one rigid motion, over the
+    length of their true way; `jitter`: mean third derivative of the estimate, 10 m/s^3; `foot_sliding_mm`:
+    motion of standing feet in 1/30 s; `shifted_mpjpe_mm`: MPJPE after one shift of the whole flight. None if
+    unknown.
     """
     _check_shapes(estimate, truth, joints, t_ns)
     by_first: list[Float] = [np.empty(0)]
@@ -166,13 +139,7 @@ def _aligned_as(own: Float, true: Float, samples: int) -> Float:
 def error_series(
     estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64
 ) -> tuple[dict[str, Series], dict[str, dict[str, Series]]]:
-    """Compute the errors of `measure` at each time, for their intervals (`intervals`).
-
-    Returns:
-        The series over all joints, by the names of `JointErrors`; and the same per joint.
-
-    ValueError: as `measure`.
-    """
+    """Compute the errors of `measure` at each time, over all joints and per joint."""
     distances = _distances(estimate, truth, joints, t_ns)
     per_joint = {name: distances.series(slice(j, j + 1)) for j, name in enumerate(joints)}
     return distances.series(slice(None)), per_joint
@@ -217,20 +184,11 @@ def measure_shape(
 ) -> dict[str, object]:
     """Measure the plausibility of a skeleton without truth: constant bone lengths, symmetry, smoothness.
 
-    Args:
-        position: [T, P, J, 3] m.
-        joints: the J names.
-        bones: pairs of joint names.
-        t_ns: [T] strictly increasing stamps.
-
-    Returns:
-        JSON-able, null for what could not be measured. `bones`: name ("left_hip-left_knee") to
-        `median_mm`, `spread_mm` (1.4826 times the median absolute deviation from the person's own median)
-        and `frames`; `bone_spread_mm`: the median of those spreads; `asymmetry_mm`: bone without its
-        side ("hip-knee") to the distance between the left and right medians, mean over people;
-        `jerk_m_s3`: the median length of the third derivative, over four consecutive samples.
-
-    ValueError: the shapes disagree, a joint of a bone is missing, or the stamps do not increase.
+    `bones`: name ("left_hip-left_knee") to `median_mm`, `spread_mm` (1.4826 times the median absolute
+    deviation from the person's own median) and `frames`; `bone_spread_mm`: the median of those spreads;
+    `asymmetry_mm`: bone without its side to the distance between the left and right medians, mean over
+    people; `jerk_m_s3`: the median length of the third derivative. ValueError, too, if a joint of a bone is
+    missing.
     """
     _check_shapes(position, position, joints, t_ns)
     lengths = bone_lengths(position, joints, bones) * 1e3
@@ -343,11 +301,7 @@ def _root(position: Float, joints: Sequence[str]) -> Float:
 
 
 def _derivative(position: Float, t_ns: Int64, order: int) -> Float:
-    """Compute the derivative [T - order, ...] from neighbouring samples, by divided differences.
-
-    It is exact for polynomials of that order with any steps. It is NaN where a sample is missing or the
-    samples span a gap in time.
-    """
+    """Compute the derivative [T - order, ...] by divided differences; NaN across gaps."""
     samples = len(t_ns)
     if samples <= order:
         return np.empty((0, *position.shape[1:]))
@@ -408,8 +362,7 @@ _COLLINEAR = 1e-9
 class Alignment:
     """Rigid motion or similarity target_from_source, x -> scale * rotation @ x + translation, one or a batch.
 
-    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
-    IEEE PAMI 13(4), 1991; equation numbers below are his.
+    S. Umeyama, IEEE PAMI 13(4), 1991; equation numbers below are his.
     """
 
     scale: Float  # [...]
@@ -424,15 +377,9 @@ class Alignment:
 
 
 def align_each(source: Float, target: Float, *, with_scale: bool) -> Alignment:
-    """Align many pairs of point sets, each pair separately.
+    """Align many pairs of point sets [..., J, 3], each pair separately, without NaN points.
 
-    Args:
-        source: [..., J, 3].
-        target: [..., J, 3]; a point with NaN on either side is left out of its pair.
-        with_scale: find similarities instead of rigid motions.
-
-    Returns:
-        A batch [...]; NaN where fewer than 3 points are common or they lie on a line.
+    The result is NaN where fewer than 3 points are common or they lie on a line.
     """
     present = (np.isfinite(source) & np.isfinite(target)).all(axis=-1, keepdims=True)
     count = present.sum(axis=-2)
@@ -465,21 +412,12 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
     """Count who was found, missed and confused over time, as the field does for several people.
 
     A reconstructed person is at a true one if the mean difference of their common joints is at most
-    `within_m`. At each time a person's last pair stays if it holds, and the others are assigned with
-    the least sum of distances (CLEAR MOT: Bernardin and Stiefelhagen 2008). A true person who is paired with
+    `within_m`. At each time a person's last pair stays if it holds, and the others are assigned with the
+    least sum of distances (CLEAR MOT: Bernardin and Stiefelhagen 2008). A true person who is paired with
     somebody else than the last time counts as a switch. For IDF1 (Ristani et al. 2016) each reconstructed
-    person is paired with one true person for the whole flight.
-
-    Args:
-        position: [T, P, J, 3] m, NaN for what was not reconstructed.
-        truth: [T, Q, J, 3] m, NaN where unknown; times at which it is unknown of everybody do not count.
-        within_m: the largest distance.
-
-    Returns:
-        `present`: joint times of true people; of these `misses`; `phantoms`: reconstructed people at no true
-        one; `switches`; `mota`: 1 - (misses + phantoms + switches) / present; `idf1`; `within_m`. NaN for the
-        two shares if no true person is present. `by_person`: for each reconstructed person the times as a
-        phantom, and the misses and switches of the true one who is theirs in IDF1 (None without one).
+    person is paired with one true person for the whole flight. `mota` is 1 - (misses + phantoms + switches) /
+    present, of joint times of true people. `by_person` has for each reconstructed person the times as a
+    phantom, and the misses and switches of the true one who is theirs in IDF1 (None without one).
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -573,12 +511,8 @@ def intervals(
 ) -> dict[str, tuple[float, float] | None]:
     """Compute the interval of every figure, of a flight with the same draws for all of them.
 
-    Args:
-        series: by name, [T] each; nothing may be NaN.
-        t_ns: [T] strictly increasing; None for independent trials.
-
-    Returns:
-        By name; None with fewer than ten samples or two trials, or if a draw has no data for the figure.
+    `series` are [T] each, without NaN; `t_ns` is None for independent trials. None with fewer than ten
+    samples or two trials, or if a draw has no data for the figure.
     """
     if t_ns is None:
         return {name: _of_trials(*each) for name, each in series.items()}
@@ -598,11 +532,7 @@ def _of_trials(sums: Float, weights: Float) -> tuple[float, float] | None:
 
 
 def resampled(series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0) -> dict[str, Float]:
-    """Compute every figure of every draw of a flight, [RESAMPLES], with the same draws for all figures.
-
-    The arguments are those of `intervals`. A value is NaN if a draw has no data for the figure. All values
-    are NaN with fewer than ten samples.
-    """
+    """Compute every figure of every draw of a flight, [RESAMPLES], as for `intervals`; NaN without data."""
     count = len(next(iter(series.values()))[0]) if series else 0
     if count < _MIN_SAMPLES:
         return {name: np.full(RESAMPLES, np.nan) for name in series}

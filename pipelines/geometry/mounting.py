@@ -1,8 +1,7 @@
 """Pose of a camera on the drone: fixed mounts, gimbals and lever arms (docs/flight.md has an example).
 
-The body is FLU (x forward, y left, z up), the camera OpenCV (x right, y down, z forward), the world ENU.
-A gimbal's frame is FLU too: its x axis is the direction of the camera's view.
-Quaternions are xyzw and unit; NaN in gives NaN out.
+The body is FLU (x forward, y left, z up), the camera OpenCV (x right, y down, z forward), the world ENU. A
+gimbal's frame is FLU, x along the view. Quaternions are xyzw and unit; NaN in gives NaN out.
 """
 
 from typing import Literal
@@ -34,14 +33,8 @@ _STRAIGHT_DEG = {"down": 90.0, "up": -90.0}
 def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
     """Compute the rotation [4] of a camera that looks in a direction of the body, tilted down by an angle.
 
-    The picture is upright: its top is up. For a camera that looks straight down, the top is forward, as for
-    a forward camera tilted down by 90 degrees. For one that looks straight up, the top is backward.
-
-    Args:
-        looks: the direction of the optical axis before the tilt.
-        down_deg: the angle of the axis below the horizon, -90 to 90.
-
-    ValueError: a tilt beyond 90 degrees, or one on top of down or up.
+    The top of its picture is up; straight down it is forward, straight up it is backward. ValueError: a tilt
+    beyond 90 degrees, or one on top of down or up.
     """
     if looks in _STRAIGHT_DEG and down_deg != 0:
         raise ValueError(
@@ -63,16 +56,9 @@ def attitude_from_angles(
 ) -> Float:
     """Compute attitudes from yaw about z, then pitch about the turned y, then roll about the twice turned x.
 
-    The angles are right-handed. The axes (see `attitude_in_enu`) determine if a positive pitch looks down
+    `order` is that in which the log lists the angles [..., 3], which are right-handed. Return
+    reference_from_gimbal [..., 4] in the axes of the angles, which determine if a positive pitch looks down
     (FLU) or up (FRD).
-
-    Args:
-        angles: [..., 3].
-        order: the order in which the log lists them; the rotation is the same for all orders.
-        units: degrees or radians.
-
-    Returns:
-        [..., 4] reference_from_gimbal, in the axes of the angles.
     """
     in_rad = np.radians(angles) if units == "deg" else angles
     yaw, pitch, roll = np.moveaxis(in_rad[..., [order.index(letter) for letter in "ypr"]], -1, 0)
@@ -82,20 +68,10 @@ def attitude_from_angles(
 def attitude_in_enu(quaternion_xyzw: Float, *, relative_to: RelativeTo, axes: Literal["enu", "ned"]) -> Float:
     """Convert a gimbal's attitude from the axes of its log to FLU and ENU.
 
-    With `enu` the world is ENU, body and gimbal FLU: yaw is counted from east to north, or from forward to
-    left, a positive pitch looks down, a positive roll lowers the right side. With `ned` the world is
-    NED, body and gimbal FRD: yaw is counted from north to east, or from forward to right, a positive
-    pitch looks up, a positive roll lowers the right side. DJI states angles in NED: pitch -90 is
-    straight down.
-
-    Args:
-        quaternion_xyzw: [..., 4] world_from_gimbal, body_from_gimbal or heading_from_gimbal.
-        relative_to: which of these three it is.
-        axes: the axes of the log.
-
-    Returns:
-        [..., 4] the attitude of an FLU gimbal in an ENU world, in an FLU body, or in a level frame with the
-        heading of the body.
+    With `enu` yaw counts from east to north, or from forward to left, and a positive pitch looks down. With
+    `ned` (FRD) yaw counts from north to east, or from forward to right, and a positive pitch looks up, as DJI
+    states angles. A positive roll lowers the right side. The quaternion [..., 4] and the result are relative
+    to an ENU world, an FLU body, or a level frame with the heading of the body.
     """
     if axes == "enu":
         return quaternion_xyzw
@@ -119,21 +95,11 @@ def compose_gimbal(
     *,
     relative_to: RelativeTo,
 ) -> Pose:
-    """Compute the poses of a camera on a gimbal.
+    """Compute the poses world_from_camera of a camera on a gimbal: position [N, 3] and quaternion [N, 4].
 
-    An attitude in the world replaces the body's rotation. One relative to the body is composed with it. One
-    relative to the heading is composed with its yaw only. The lever arm goes from the body's origin to the
+    An attitude [N, 4] in the world replaces the body's rotation, one relative to the body is composed with
+    it, one relative to the heading with its yaw only. The lever arm [3] m goes from the body's origin to the
     camera and always turns with the body: the arm of the gimbal's own joints is assumed to be part of it.
-
-    Args:
-        world_from_body: position [N, 3] m and quaternion [N, 4], ENU from FLU.
-        lever_arm: [3] m, in the body.
-        attitude_xyzw: [N, 4] the gimbal's attitude at the stamps of the body's poses (`attitude_in_enu`).
-        gimbal_from_camera_xyzw: [4]; `body_from_camera("forward")` unless the camera is tilted in its gimbal.
-        relative_to: the reference of the attitude.
-
-    Returns:
-        world_from_camera: position [N, 3] and quaternion [N, 4].
     """
     position, world_from_body_xyzw = world_from_body
     if relative_to == "world":

@@ -1,12 +1,9 @@
 """Models of the errors of logged poses, used as priors and to simulate noisy logs.
 
-The error of a pose is a translation in m and a rotation vector in rad. The translation is along the
-world's axes, or along the camera's with `frame: body`; the rotation is about the camera's axes, applied
-on the right: noisy world_from_camera = (p + translation, q * exp(rotation)). Sigmas are per axis. The
-errors of several models add up.
-
-Models are registered under `mocap.noise_models`; `build` takes the classes by their registered names.
-`PoseErrors` is the prior that such models are for the estimate of poses.
+An error is a translation in m along the world's axes, or the camera's with `frame: body`, and a rotation
+vector in rad about the camera's axes: noisy world_from_camera = (p + translation, q * exp(rotation)). Sigmas
+are per axis. The errors of several models add up. `PoseErrors` is the prior that they are for the estimate of
+poses.
 """
 
 from __future__ import annotations
@@ -49,29 +46,16 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def marginal_sigma(self, elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float) -> Float:
-        """Compute the marginal standard deviation of the error at each time.
+        """Compute the standard deviation [T, 2] of the error, per axis of position (m) and rotation (rad).
 
-        Args:
-            elapsed_s: [T] time since the first pose.
-            speed_mps: [T] speed of the camera.
-            turn_rate_radps: [T] angular speed of the camera.
-
-        Returns:
-            [T, 2] per axis of the position (m) and of the rotation (rad).
+        `elapsed_s` counts from the first pose; `speed_mps` and `turn_rate_radps` are the camera's.
         """
 
     @abstractmethod
     def errors(self, t_ns: Int64, position: Float, quaternion_xyzw: Float, rng: np.random.Generator) -> Float:
-        """Draw the errors of a whole log once.
+        """Draw the errors of a whole log: [T, 6] translation in the world, rotation vector in the camera.
 
-        Args:
-            t_ns: [T] strictly increasing stamps.
-            position: [T, 3] m, the true world_from_camera.
-            quaternion_xyzw: [T, 4] unit, the same.
-            rng: the random generator.
-
-        Returns:
-            [T, 6]: translation in the world (m), rotation vector in the camera (rad).
+        The stamps increase strictly; position [T, 3] m and quaternion [T, 4] are the true world_from_camera.
         """
 
 
@@ -244,18 +228,7 @@ def disturb(
     quaternion_xyzw: Float,
     rng: np.random.Generator,
 ) -> tuple[Float, Float]:
-    """Apply the models' errors to a log; the errors are added up before they are applied.
-
-    Args:
-        models: the errors, drawn in this order.
-        t_ns: [T] strictly increasing stamps.
-        position: [T, 3] m, the true world_from_camera.
-        quaternion_xyzw: [T, 4] unit, the same.
-        rng: the random generator; the same state gives the same log.
-
-    Returns:
-        Position [T, 3] and quaternion [T, 4].
-    """
+    """Apply the models' errors, added up before, to a log of true world_from_camera."""
     error = np.zeros((len(t_ns), 6))
     for model in models:
         error += model.errors(t_ns, position, quaternion_xyzw, rng)
@@ -304,8 +277,8 @@ class Process:
     def stray(self, elapsed_s: float) -> float:
         """Compute the mean variance about the straight line between two values `elapsed_s` apart.
 
-        That of a Brownian bridge, rate^2 s (T - s) / T, over its length; a Gauss-Markov process is
-        a walk of rate sigma sqrt(2 / correlation time) over short times.
+        That of a Brownian bridge; a Gauss-Markov process is a walk of rate sigma sqrt(2 / correlation time)
+        then.
         """
         rate2 = self.rate**2
         if np.isfinite(self.correlation_s):
@@ -350,10 +323,9 @@ class PoseErrors:
 
 
 def pose_errors(models: Sequence[NoiseModel]) -> PoseErrors:
-    """Convert stated noise models to a prior.
+    """Convert stated noise models to a prior; ValueError for a model that is not one of flight.yaml's.
 
     Latency is left to the clock: a delayed log and a clock offset differ only where cameras accelerate.
-    ValueError: a model is not one of flight.yaml's.
     """
     white = np.zeros(2)
     merged: dict[int, tuple[float, float]] = {}
@@ -413,14 +385,9 @@ def errors_of_level(level: Float) -> PoseErrors:
 def build(
     parts: Iterable[tuple[str, Mapping[str, object]]], classes: Mapping[str, type[NoiseModel]]
 ) -> list[NoiseModel]:
-    """Build noise models from names and parameters.
+    """Build noise models from names and parameters: `pose_noise.items()` of a flight, or `parse(text)`.
 
-    Args:
-        parts: (name, parameters) of each model: `pose_noise.items()` of a flight, or `parse(text)`.
-        classes: every known model by its registered name.
-
-    ValueError: an unknown model or parameter (the message lists the known ones), a missing parameter, or a
-    value that is out of range.
+    ValueError: an unknown model or parameter (the message lists the known ones), a missing or wrong one.
     """
     return [_build_one(name, parameters, classes) for name, parameters in parts]
 

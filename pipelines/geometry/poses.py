@@ -125,15 +125,9 @@ def transform(target_from_source: tuple[Float, Float], points: Float) -> Float:
 
 
 def look_at(position: Float, target: Float) -> Float:
-    """Compute the orientation of upright cameras that look at a point.
+    """Compute world_from_camera [..., 4], w >= 0, of upright cameras that look at a point.
 
-    Args:
-        position: [..., 3] metres, world.
-        target: [..., 3] metres, world; a camera exactly above it has north up in its picture.
-
-    Returns:
-        [..., 4] unit quaternions xyzw, world_from_camera (x right, y down, z forward),
-        with w >= 0.
+    A camera exactly above it has north up in its picture.
     """
     forward = target - position
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
@@ -156,25 +150,12 @@ def interpolate_poses(
     max_gap_ns: int,
     max_extrapolation_ns: int,
 ) -> tuple[Float, Float]:
-    """Interpolate poses between the stamps of a log: linear in position, slerp in rotation.
+    """Interpolate poses between strictly increasing stamps [N]: linear in position, slerp in rotation.
 
-    At a stamp, the result is that row itself. Just outside the log, the nearest pose is held. The error of
-    this is bounded by speed times tolerance; a line through the last two rows would amplify their noise.
-
-    Args:
-        t_ns: [N] strictly increasing stamps.
-        position: [N, 3] m.
-        quaternion_xyzw: [N, 4] unit; rows may differ in sign.
-        at_ns: [M] times to interpolate to, in any order.
-        max_gap_ns: stamps further apart than this have no pose between them.
-        max_extrapolation_ns: the longest time before the first and after the last stamp for which a pose is
-            held.
-
-    Returns:
-        Position [M, 3] and quaternion [M, 4], NaN where the log has no pose. Signs are those of the log, made
-        continuous from its first row on.
-
-    ValueError: the stamps do not increase strictly.
+    At a stamp, the result is that row itself. The nearest pose is held for `max_extrapolation_ns` outside the
+    log: a line through the last two rows would amplify their noise. Position [M, 3] and quaternion [M, 4] are
+    NaN where the log has no pose, also between stamps further apart than `max_gap_ns`. Signs are made
+    continuous from the log's first row on.
     """
     between = _bracket(t_ns, at_ns, max_gap_ns, max_extrapolation_ns)
     if not len(t_ns):
@@ -188,18 +169,9 @@ def interpolate_poses(
 
 
 def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: int) -> Float:
-    """Interpolate values between stamps linearly; never outside them or across a gap or a missing sample.
+    """Interpolate values [N, ...] between strictly increasing stamps linearly; exact at a stamp.
 
-    Args:
-        t_ns: [N] strictly increasing stamps.
-        values: [N, ...]; NaN is missing.
-        at_ns: [M] times to interpolate to, in any order.
-        max_gap_ns: there is no interpolation between stamps further apart than this.
-
-    Returns:
-        [M, ...]; NaN where a neighbour is missing. Exactly at a stamp, the result is that sample.
-
-    ValueError: the stamps do not increase strictly.
+    NaN outside them, in gaps longer than `max_gap_ns`, and where a neighbour is missing.
     """
     between = _bracket(t_ns, at_ns, max_gap_ns, 0)
     if not len(t_ns):
@@ -212,15 +184,10 @@ def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: 
 
 
 def velocities(t_s: Float, values: Float, follows: Bool) -> tuple[Float, Float]:
-    """Compute velocities from the sample before, and to the one after; each sample has a time of its own.
+    """Compute velocities [N, ..., D] from the sample before, and to the one after.
 
-    Args:
-        t_s: [N, ...] s when each value was sampled; NaN where it was not.
-        values: [N, ..., D]; NaN is missing.
-        follows: [N - 1, ...] whether a sample goes on from the one before; broadcast.
-
-    Returns:
-        [N, ..., D] per s, twice; NaN where a neighbour is missing or was not sampled earlier, or later.
+    `t_s` [N, ...] is NaN where nothing was sampled; `follows` [N - 1, ...] says that a sample goes on from
+    the one before. NaN where a neighbour is missing or was not sampled earlier, or later.
     """
     step_s = np.diff(t_s, axis=0)
     step_s = np.where(follows & (step_s > 0), step_s, np.nan)
@@ -315,13 +282,9 @@ def carried_covariance(
     rotation_xyzw: Float = _NO_TURN,
     scale: float = 1.0,
 ) -> Float:
-    """Transform covariances of poses to other axes.
+    """Transform covariances [..., 6, 6] of poses by rotations of the axes of positions and of rotations.
 
-    Args:
-        covariance: [..., 6, 6] position, then rotation vector.
-        position_xyzw: [..., 4] rotation of the axes of positions, which are then scaled.
-        rotation_xyzw: [..., 4] rotation of the axes of rotation vectors.
-        scale: factor on positions.
+    Positions are then scaled.
     """
     turns = (matrix_from_quaternion(each) for each in (position_xyzw, rotation_xyzw))
     of_position, of_rotation = np.broadcast_arrays(*turns)
@@ -333,8 +296,7 @@ def carried_covariance(
 def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> Float:
     """Convert a covariance in ROS's convention to one with its rotation part about the body's axes.
 
-    geometry_msgs/PoseWithCovariance turns about fixed axes: R_true = exp(w) R. As exp(w) R = R exp(R' w),
-    the rotation vector in the body is R' w; the position stays in the world.
+    geometry_msgs/PoseWithCovariance turns about fixed axes: R_true = exp(w) R = R exp(R' w).
     """
     return carried_covariance(covariance, rotation_xyzw=conjugate(world_from_body_xyzw))
 
@@ -342,20 +304,11 @@ def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> F
 def mounted_covariance(
     covariance: Float, world_from_body_xyzw: Float, lever_arm: Float, world_from_camera_xyzw: Float
 ) -> Float:
-    """Compute the covariance of a camera's pose from that of the body that carries it.
+    """Compute the covariance [..., 6, 6] of a camera's pose from that of the body that carries it.
 
-    A rotation error w of the body (about world axes) moves the camera by w x (R lever_arm) and turns it
-    by the same w. The same is assumed for a gimbal that holds its attitude in the world: that attitude comes
-    from the body's own estimate of north and down, and logs have no better value for its error.
-
-    Args:
-        covariance: [..., 6, 6] position in world, rotation vector in the body.
-        world_from_body_xyzw: [..., 4] unit.
-        lever_arm: [3] or [..., 3] m, the camera's position in the body.
-        world_from_camera_xyzw: [..., 4] unit.
-
-    Returns:
-        [..., 6, 6] the camera's position in world, rotation vector in the camera.
+    A rotation error w of the body (about world axes) moves the camera by w x (R lever_arm) and turns it by
+    the same w; so it is for a gimbal that holds its attitude in the world, which it has from the body's own
+    estimate. Rotation vectors are in the body, then in the camera; the lever arm [3] m is in the body.
     """
     world_from_body = matrix_from_quaternion(world_from_body_xyzw)
     camera_from_world = np.swapaxes(matrix_from_quaternion(world_from_camera_xyzw), -1, -2)
@@ -423,19 +376,10 @@ def chain(
 ) -> FrameChain:
     """Compute the pose of `child` in `parent`: interpolate every link on the shortest path and compose them.
 
-    Args:
-        links: (target, source) to target_from_source.
-        parent: the frame in which the pose is wanted.
-        child: the frame whose pose is wanted.
-        at_ns: [M] times. The default is the stamps of the link on the path that has the most (the one
-            nearest to the child among equals), so that no detail of the fastest motion is lost. A path of
-            static links only has one row, at its latest stamp.
-        max_gap_ns: a link has no pose between stamps that are further apart than this.
-        max_extrapolation_ns: the longest time before its first and after its last stamp for which a link is
-            held.
-
-    ValueError: an unknown frame (the message gives the nearest known names), no path between the two, or the
-    same frame twice.
+    The times are by default the stamps of the link on the path that has the most (the one nearest to the
+    child among equals); a path of static links only has one row, at its latest stamp. Gaps and extrapolation
+    are as in `interpolate_poses`. ValueError: an unknown frame (with the nearest known names), no path, or
+    the same frame twice.
     """
     route = find_route(links, parent, child)
     on_the_way = [links[edge] for edge in route.edges]

@@ -1,32 +1,23 @@
 """Triangulation of image points to 3D points, over all frames, people and joints in one call.
 
-There are three methods. `midpoint` and `robust` are weighted by the square of the detector's confidence w.
-A view of confidence w has the standard deviation pixel_sigma / w: its rows are multiplied by w.
+A view of confidence w has the standard deviation pixel_sigma / w.
 
 - `dlt`: homogeneous linear triangulation of viewing directions by pycolmap, without confidences: a baseline.
-  The world is moved to the mean centre of the cameras, and its unit is their RMS distance from it. Without
-  that, the result depends on the origin and fails under pose noise.
+  The world is moved to the mean centre of the cameras, and its unit is their RMS distance from it.
 - `midpoint`: the point closest to the viewing lines, sum w^2 (I - d d')(X - c) = 0.
 - `robust`: least squares of the reprojection errors, whitened by pixel and pose noise together. If every
   view is within `gate` standard deviations, this is the result. Otherwise every pair of views (above 8
   cameras a fixed set of 28) proposes a point. The point with the lowest truncated cost over all views wins
-  (MSAC: Torr & Zisserman 2000). It is refined by Gauss-Newton on its inliers, which are chosen again until
-  they stay the same.
+  (MSAC: Torr & Zisserman 2000). It is refined by Gauss-Newton on its inliers until they stay the same. If
+  only two of three or more views agree and another pair agrees on a different place, it is `rejected`.
 
-Two views agree by their epipolar distance alone. If only two of three or more views agree and another
-pair agrees on a different place, it is not possible to know which pair is right, and the joint is
-`rejected`. On the walk of docs/results.md this costs 0.1 % of the joint-frames and reduces the mean error
-from 13.6 to 13.0 mm.
+A gate in pixels would reject good views as soon as poses are noisy: 1 deg is 26 px at f = 1500. State the
+pose noise in `Views.pose_sigma`, and let `estimate_noise` raise the pixel noise to what the views need.
 
-A gate in pixels would reject good views as soon as poses are noisy: 1 deg is 26 px at f = 1500. State
-the pose noise in `Views.pose_sigma`, and let `estimate_noise` raise the pixel noise to what the views need.
-
-That gate must be as wide as the pose errors: 0.3 m and 1 deg move a keypoint by 50 px, so a keypoint that is
-itself wrong by 100 px passes it. But a pose error moves all joints of a person in a picture together, and a
-gross error of one joint does not. `triangulate_pictures` therefore moves each picture by the median of its
-joints' residuals, which removes the pose error, and finds the views with gross errors by `robust` with exact
-poses. These are left out; all others are triangulated with the stated pose noise. The benefit is measured in
-docs/estimate.md.
+Such a gate lets gross errors of single joints pass. But a pose error moves all joints of a person in a
+picture together. `triangulate_pictures` therefore moves each picture by the median of its joints' residuals,
+finds the views with gross errors by `robust` with exact poses, and triangulates all others with the stated
+pose noise.
 """
 
 from __future__ import annotations
@@ -74,9 +65,9 @@ _LEAST_INFORMATION = 1e-12
 class Views:
     """Observations of N joint-frames by C cameras, and the cameras' poses at F instants.
 
-    A view is absent where `rays` or the pose is NaN or `weight` is 0. Rays are normalised image points,
-    undistorted, (x/z, y/z) in the camera's frame. Joints of one instant share its row of poses. Triangulation
-    is fastest if joints of one instant are neighbours in N.
+    A view is absent where `rays` or the pose is NaN or `weight` is 0. Rays are undistorted image points (x/z,
+    y/z). Triangulation is fastest if joints of one instant, which share its row of poses, are neighbours in
+    N.
     """
 
     rays: Float  # [N, C, 2]
@@ -127,7 +118,7 @@ class Triangulation:
     """Points with their uncertainty and residuals, NaN (and no inliers) wherever `status` is not "ok".
 
     `covariance` is of first order: pixel and pose noise of the inlier views, independent between cameras. It
-    includes the part of a pose error that all joints share, so it is that of the absolute position.
+    includes the part of a pose error that all joints share.
     """
 
     points: Float  # [N, 3] m, world
@@ -139,9 +130,10 @@ class Triangulation:
 
 
 def triangulate(views: Views, *, method: Method, min_views: int = 2, gate: float = GATE) -> Triangulation:
-    """Triangulate every joint-frame.
+    """Triangulate every joint-frame by a method of the module; ValueError for min_views below 2, or no gate.
 
-    Statuses besides "ok":
+    `gate` counts standard deviations of a view's image point, pixel and pose noise together. Statuses besides
+    "ok":
 
     * `not_detected`: by no camera.
     * `few_views`: detected by fewer than `min_views` cameras.
@@ -149,13 +141,6 @@ def triangulate(views: Views, *, method: Method, min_views: int = 2, gate: float
     * `low_parallax`: no two viewing lines differ by `MIN_PARALLAX_DEG` (opposite directions do not count).
     * `rejected`: fewer than `min_views` views agree within `gate` (`robust`), or the point is behind one of
       its cameras (`dlt` and `midpoint`, which reject no view).
-
-    Args:
-        method: see the module; `min_views` and the parallax apply to all three, `gate` to `robust`.
-        min_views: views needed, and inliers needed; at least 2.
-        gate: in standard deviations of a view's image point, pixel and pose noise together.
-
-    ValueError: min_views below 2, or a gate that is not above 0.
     """
     if min_views < 2 or not gate > 0:
         raise ValueError(f"min_views={min_views}, gate={gate}: out of range")
@@ -301,10 +286,9 @@ def _covariance(
 ) -> Float:
     """Compute the covariances [N, 3, 3] of points that are at `place` [N, C, 3] in the cameras' frames.
 
-    To first order, every method solves sum J'V(r + J dX) = 0 with its own weight V of a view's image residual
-    r. So with H = sum J'VJ, the noise S of the views gives H^-1 (sum J'VSVJ) H^-1. For `robust`, V is S^-1.
-    The distance to a line is z times the part of (r, 0) across the direction (u, v, 1). `midpoint` minimises
-    its square times that of the confidence, `dlt` its square.
+    Every method solves sum J'V(r + J dX) = 0 with its own weight V of a view's image residual r. With H = sum
+    J'VJ, the noise S of the views gives H^-1 (sum J'VSVJ) H^-1. For `robust`, V is S^-1; `midpoint` minimises
+    the square of the distance to a line times that of the confidence, `dlt` its square.
     """
     depth = np.where(inlier & (place[..., 2] > 0), place[..., 2], 1.0)
     image = place[..., :2] / depth[..., None]
@@ -332,11 +316,7 @@ def _covariance(
 
 
 def reprojection_px(views: Views, points: Float) -> Float:
-    """Compute the reprojection distance [N, C] in px of views; NaN for absent views, inf behind a camera.
-
-    Args:
-        points: [N, 3] m; NaN gives NaN.
-    """
+    """Compute the reprojection distance [N, C] in px of views; NaN for absent views, inf behind a camera."""
     if len(points) > _ROWS_AT_ONCE:
         parts = [slice(first, first + _ROWS_AT_ONCE) for first in range(0, len(points), _ROWS_AT_ONCE)]
         return np.concatenate([reprojection_px(_rows(views, part), points[part]) for part in parts])
@@ -352,19 +332,13 @@ def reprojection_px(views: Views, points: Float) -> Float:
 def estimate_noise(views: Views) -> Float:
     """Estimate the pixel noise per axis [C] that explains the views' residuals; at least the stated one.
 
-    Residuals may be larger than the stated pixel and pose noise explain, because poses are worse than their
-    log states or the detector is less accurate than assumed. The excess is added as pixel noise by one factor
-    k for all cameras. k^2 is the median over joint-frames of the whitened squared residuals divided by the
-    median of their chi-square distribution with 2m - 3 degrees of freedom. The first k comes from one pair of
-    views per joint-frame, which tolerates up to 29 % bad views for any number of cameras. Later values come
-    from the inliers that `robust` finds with it.
+    The excess is added as pixel noise by one factor k for all cameras: k^2 is the median over joint-frames of
+    the whitened squared residuals divided by the median of their chi-square distribution with 2m - 3 degrees
+    of freedom. The first k comes from one pair of views per joint-frame, later ones from the inliers of
+    `robust`. One factor, not one per camera: under constant pose errors a camera's residuals are a single
+    draw.
 
-    One factor, not one per camera: under constant pose errors a camera's residuals are a single draw, and
-    weighting by them costs 3 to 7 % (docs/results.md).
-
-    Use it as `replace(views, pixel_sigma=estimate_noise(views))` if poses come from a log, even one that
-    states its noise: if that is right, little changes. For still, calibrated cameras, state the detector's
-    pixel noise instead: their residuals are the detector's errors, and a wider gate would keep these errors.
+    For still, calibrated cameras, state the detector's pixel noise instead: their residuals are its errors.
     """
     n, cameras = views.weight.shape
     if cameras < 2:
@@ -388,12 +362,9 @@ def estimate_noise(views: Views) -> Float:
 
 
 def residual_sigma(views: Views, result: Triangulation, least_px: Float) -> Float:
-    """Compute the pixel noise per axis [C] with which the inliers' residuals have their expected median.
+    """Compute the pixel noise per axis [C] that gives the inliers their expected median.
 
-    Args:
-        views: the views, with the stated noise.
-        result: their triangulation.
-        least_px: [C] the least that is returned.
+    It is at least `least_px`.
     """
     seen = np.where(result.inlier, views.weight, np.nan)
     variance = views.pixel_sigma**2 + seen**2 * pose_variance_px(views, result.points)  # of confidence 1
@@ -471,18 +442,10 @@ _GROSS_ROUNDS = 2
 def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) -> Triangulation:
     """Triangulate with `robust`, without views that have gross errors relative to the rest of their picture.
 
-    Without gross errors, the result is that of `triangulate`, byte for byte. A wrong clock offset moves
-    joints of a picture apart as well: with some tenths of a second, fast limbs are left out.
-
-    Args:
-        views: the observations; `views.pixel_sigma` as `estimate_noise` found it.
-        picture: [N] ascending; rows with the same number are the joints of one person in one picture of every
-            camera. If a camera shows fewer than five of them, its views are not judged.
-        pixel_sigma: [C] px, that of the detector alone; `views.pixel_sigma` includes unexplained pose errors.
-
-    Returns:
-        As `triangulate`. Views that are left out are not inliers but have their residuals. A joint-frame with
-        too few views because of them is `rejected`.
+    `views.pixel_sigma` is that of `estimate_noise`, `pixel_sigma` [C] px that of the detector alone.
+    `picture` [N] ascends; rows with the same number are the joints of one person in one picture of every
+    camera. A camera that shows fewer than five of them is not judged. Views that are left out are not inliers
+    but have their residuals. Without gross errors, the result is that of `triangulate`, byte for byte.
     """
     if len(picture) > _ROWS_AT_ONCE:
         cuts = np.searchsorted(picture, picture[_ROWS_AT_ONCE::_ROWS_AT_ONCE]).tolist()

@@ -1,7 +1,5 @@
 """Compiled kernel of the `robust` triangulation; `triangulation` is its only user and explains the method.
 
-A joint-frame's result depends only on its own numbers, so any division of the work gives the same bytes.
-
 Rows by camera: `camera` has 0-8 the world_from_camera rotation by rows and 9-11 the centre, in a world moved
 to the mean centre; `view` has 0-1 the image point, 2-4 its direction in the world (depth 1), 5 the squared
 length of that, and the covariance of the image point, 6-8 from pixels and rotation, 9-11 from the position
@@ -123,8 +121,8 @@ def _refine(
 ) -> tuple[float, float, float, float, float]:
     """Refine a point by Gauss-Newton on the whitened reprojection errors of the used views.
 
-    A step that raises the cost is shortened, so the result is never worse than the start. The function stops
-    if the linear model predicts a cost above `hopeless`. It returns the point, the cost and the largest term.
+    The result is never worse than the start. The function stops if the linear model predicts a cost above
+    `hopeless`. It returns the point, the cost and the largest term.
     """
     x, y, z = start
     dx = dy = dz = 0.0
@@ -283,18 +281,10 @@ def fit_robustly(
 ) -> None:
     """Fit the joint-frames of status OK: all views by least squares if all agree, else the best inliers.
 
-    Args:
-        view: [N, C, 12].
-        camera: [F, C, 12].
-        pose_index: [N] row of `camera`.
-        pairs_by_count: [m, k, 2] pairs of m views that propose a point.
-        pair_count: [m].
-        gate2: squared gate.
-        cos2_min: squared cosine of the least parallax.
-        min_views: inliers needed.
-        point: [N, 3] the closest point to the viewing lines; the result.
-        inlier: [N, C] usable views; the result.
-        status: [N]; rejected joint-frames are marked.
+    `view` [N, C, 12] and `camera` [F, C, 12] are rows of the module, `pose_index` [N] the row of `camera`,
+    `pairs_by_count` [m, k, 2] with `pair_count` [m] the pairs of m views that propose a point, `gate2` and
+    `cos2_min` squares of the gate and of the cosine of the least parallax. `point` [N, 3], first the closest
+    to the viewing lines, `inlier` [N, C], first the usable views, and `status` [N] become the result.
     """
     for n in range(len(status)):
         if status[n] != OK:

@@ -1,7 +1,6 @@
-"""Poses of a session's cameras at given times, and their uncertainty.
+"""Poses of a session's cameras at given times, as far as the logs are trusted, and their uncertainty.
 
-Poses are interpolated as far as the manifest trusts the logs. Their uncertainty is stated by the command
-line, flight.yaml, or the log itself; the first of these that states one is used, and all three may be silent.
+The uncertainty is that of the command line, else of flight.yaml, else of the log; all may be silent.
 """
 
 from collections.abc import Iterable, Mapping
@@ -107,12 +106,11 @@ def stated_noise(
 
 
 def logged_covariance(trajectory: Trajectory) -> Float | None:
-    """Return the logged covariances [N, 6, 6] with unknown variances filled in.
+    """Return the logged covariances [N, 6, 6] with unknown variances filled in; None if no pose has one.
 
-    An axis with an unknown variance (`known_variances`) gets the mean of the pose's known variances of its
-    kind (position or rotation), and no correlation with other axes. A pose without a known variance of a kind
-    gets the median of the other poses. The result is None if no pose has one. A matrix that is not a valid
-    covariance (an eigenvalue of its correlations is negative) keeps its variances only.
+    An unknown variance (`known_variances`) becomes the mean of the pose's known ones of its kind (position or
+    rotation), else the median of the other poses, without correlation. A matrix that is not a valid
+    covariance keeps its variances only.
     """
     if trajectory.covariance is None:
         return None

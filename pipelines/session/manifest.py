@@ -1,9 +1,8 @@
 """`flight.yaml`: the files of one flight and how they belong together.
 
-A source is a file, or a topic of a log. Its format is recognised by content, and the options that belong
-to the format stand beside it: a calibration holds cameras, a log holds topics. Of the options of drones' own
-logs, a format lists those that it takes in an attribute `choices`. All problems of a manifest are reported in
-one message, an unknown key with the nearest known one.
+A source is a file, or a topic of a log. Its format is recognised by content, and the options of the format
+stand beside it. Of the options of drones' own logs, a format lists those that it takes in an attribute
+`choices`. All problems of a manifest are reported in one message, an unknown key with the nearest known one.
 """
 
 from __future__ import annotations

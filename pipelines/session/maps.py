@@ -1,13 +1,11 @@
 """Occupancy maps of a session: `map/0.npz`, `map/1.npz`, ... and `map/index.json`.
 
-One npz (a zip of .npy files) holds one grid. Any program may write one, so these are the rules:
+One npz holds one grid. Any program may write one:
 
 - `probability`: float [X, Y, Z], 0..1, NaN where nothing is known. Instead of it `occupancy`: bool, or
   integers as in nav_msgs/OccupancyGrid (0 to 100 percent, -1 unknown).
 - `origin`: [3], metres, the corner of voxel (0, 0, 0); `resolution_m`: the side of a voxel.
 - `from_ns`: the time from which the map holds; optional, 0.
-
-The same map gives the same bytes. Nothing in a file is unpickled, and nothing is used before it is checked.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Parts of one flight on several processes, or on the machines of a Dask cluster, through one executor.
 
-A part is a call of a function of this package. Its result depends on its arguments and on the session, and on
-nothing else. It travels back to the process that holds the session's lock, and only that process writes. The
-memory of parts: freed arrays go back to the system, and arrays that wait stand in a file.
+The result of a part depends on its arguments and on the session alone. It travels back to the process that
+holds the session's lock, and only that process writes. Arrays that wait stand in a file.
 """
 
 import ctypes
@@ -42,8 +41,8 @@ def each_part(
 ) -> Generator[tuple[int, R]]:
     """Call a function of a module with every part; yield number and result in the order in which they end.
 
-    Closed early, the parts that are not done are cancelled. With one worker this process works; `executor`
-    works instead of processes. MocapError: the first that a part raised, or a worker could not run it.
+    Closed early, the parts that are not done are cancelled. One worker is this process; an `executor` works
+    instead. MocapError: the first that a part raised, or a worker could not run it.
     """
     workers = min(workers, len(parts))
     if executor is None and (workers < 2 or multiprocessing.current_process().daemon):
@@ -196,9 +195,8 @@ ALIGNMENT_BYTES = 64
 def return_freed_arrays() -> None:
     """Let freed blocks of 4 MB and more go back to the system at once.
 
-    glibc takes blocks of up to 32 MB from its heap once some of them were freed. The heap gets holes there
-    that nothing fills: a refinement of ten minutes held 2.8 GB, a third of it in use. Other C libraries have
-    no such setting, and need none.
+    glibc takes blocks of up to 32 MB from its heap once some were freed, and its holes are never filled: a
+    refinement of ten minutes held 2.8 GB, a third of it in use. Other C libraries need no such setting.
     """
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:

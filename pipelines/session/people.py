@@ -1,12 +1,8 @@
 """Skeletons, and positions of people that are known without a reconstruction: logged actors and true joints.
 
-All skeletons share joint names, so that converting one into another only needs the names. Detectors place
-some of these joints at slightly different points; the differences are constant over time:
-
-* `neck` is the midpoint of the shoulders in body25; body25b's lies above it by 3 % of the body's height.
-* `hip` is the midpoint of the hips; in body25 it is what OpenPose calls MidHip.
-* BlazePose's `foot_index`, the tip of the foot, is called `big_toe`, the nearest joint that others have. Its
-  mouth corners are `left_mouth` and `right_mouth`.
+All skeletons share joint names. Detectors place some of these joints at slightly different points: `neck` is
+the midpoint of the shoulders in body25, and lies 3 % of the body's height above it in body25b; `hip` is the
+midpoint of the hips; BlazePose's `foot_index`, the tip of the foot, is called `big_toe`.
 """
 
 import re
@@ -249,8 +245,7 @@ GAP_IN_USUAL_STEPS = 1.5
 def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
     """Interpolate true positions [T, P, J, 3] at given times, linearly.
 
-    The result is NaN outside the stamps of the truth, next to a sample without the joint, and across a gap
-    longer than `longest_step_ns`.
+    NaN outside the truth, next to a sample without the joint, and across a gap longer than `longest_step_ns`.
     """
     return interpolate_points(truth.t_ns, truth.position, t_ns, max_gap_ns=longest_step_ns(truth.t_ns))
 
@@ -258,8 +253,8 @@ def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
 def longest_step_ns(t_ns: Int64) -> int:
     """Return the longest step between samples that is not a gap; 0 for fewer than two samples.
 
-    Truth may be sampled whenever one of several cameras takes a picture. Two cameras of 25 Hz that are not
-    synchronised give alternating steps of 8 and 32 ms, and neither is a gap.
+    Two cameras of 25 Hz that are not synchronised give alternating steps of 8 and 32 ms, and neither is a
+    gap.
     """
     steps = np.diff(t_ns)
     return int(GAP_IN_USUAL_STEPS * np.percentile(steps, PERCENTILE_OF_USUAL_STEPS)) if len(steps) else 0

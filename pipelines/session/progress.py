@@ -56,10 +56,9 @@ class Halt:
 
 
 def side_by_side(work: Callable[[T], R], parts: Iterable[T], *, workers: int, halt: Halt) -> list[R]:
-    """Call `work` on every part in parallel and return the results in the order of the parts.
+    """Call `work` on every part in threads and return the results in the order of the parts.
 
-    Threads are enough, because the long calculations release the interpreter lock. `work` checks `halt` from
-    time to time; it is set when one part fails or the user interrupts. A single worker is the calling thread.
+    `work` checks `halt` from time to time; it is set when one part fails or the user interrupts.
     """
     if workers == 1:
         return [work(part) for part in parts]

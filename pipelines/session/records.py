@@ -1,7 +1,6 @@
 """Records that readers return and writers take: plain frozen dataclasses of numpy arrays.
 
-Conventions (DESIGN): world ENU in metres, camera x right, y down, z forward, stamps int64 ns,
-quaternions xyzw, transforms named target_from_source, missing is NaN and never 0.
+World ENU in metres, camera x right, y down, z forward, stamps int64 ns, quaternions xyzw, missing is NaN.
 """
 
 from __future__ import annotations
@@ -27,8 +26,7 @@ POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 class Trajectory:
     """Logged poses of one moving object.
 
-    Rows are sorted by time, stamps strictly increase and every number is finite. Readers leave bad
-    rows out and count them by cause in `dropped` (for example {"not finite": 3, "duplicate stamp": 1}).
+    Stamps strictly increase and every number is finite. Readers count bad rows by cause in `dropped`.
     """
 
     t_ns: Int64  # [N]
@@ -43,9 +41,9 @@ class Trajectory:
 class CalibratedCamera:
     """One camera of a calibration file; either part may be absent from the file.
 
-    Some calibrations do not state the size of their pictures. It is then that of which the principal point
-    is the middle, and `size_stated` is False: the pictures themselves decide. `note` says what else the file
-    states and is not used, or used otherwise.
+    Without a stated size of the pictures it is that of which the principal point is the middle, `size_stated`
+    is False, and the pictures decide. `note` says what else the file states and is not used, or used
+    otherwise.
     """
 
     intrinsics: Intrinsics | None
@@ -59,8 +57,8 @@ class CalibratedCamera:
 class Detections:
     """People that a keypoint detector found in one camera's frames, sorted by frame, then person.
 
-    A joint that was not found has NaN in `xy` and 0 confidence. `person` is the detector's own id, or
-    the rank within the frame where it has none. `image_size` is None if the file does not state it.
+    A joint that was not found has NaN in `xy` and 0 confidence. `person` is the detector's own id, or the
+    rank within the frame where it has none.
     """
 
     joints: tuple[str, ...]
@@ -258,9 +256,8 @@ UNTIMED, SHARED_SECONDS = "pictures without times", "pictures of whole seconds"
 class VideoIndex:
     """Presentation times of the frames of a video. Frame k is the k-th in presentation order, from 0.
 
-    Every frame that the container lists has a row, from the first one that a decoder gives on. A damaged
-    frame is missing and the others keep their numbers. Frames that the container lists but the file no longer
-    holds are counted in `dropped`.
+    Every frame that the container lists has a row, from the first one that a decoder gives on. Frames that
+    the file no longer holds are counted in `dropped`.
     """
 
     pts_ns: Int64  # [N] strictly increasing, since the first frame: pts_ns[0] is 0
@@ -292,8 +289,8 @@ class VideoIndex:
 class Occupancy:
     """A voxel map: probability of being occupied, 0.5 and above is occupied, NaN where nothing is known.
 
-    `dropped` counts by cause what a reader left out of the file. `crs` is the coordinate reference system
-    that the file names for its axes (WKT or `EPSG:n`). Neither is stored with the map.
+    `dropped` counts by cause what a reader left out. `crs` is what the file names for its axes (WKT or
+    `EPSG:n`).
     """
 
     probability: NDArray[np.float32]  # [X, Y, Z]
@@ -353,8 +350,8 @@ class PositionTrack:
 class AttitudeTrack:
     """The attitude of a body or a gimbal over time; stamps strictly increase.
 
-    A body (FLU) is relative to an ENU world. A gimbal (FLU, x along the camera's view) is relative to the
-    world, to its body, or to a level frame with the heading of the body.
+    A body (FLU) is relative to an ENU world, a gimbal (FLU, x along the view) to the world, to its body, or
+    to a level frame with the heading of the body.
     """
 
     name: str

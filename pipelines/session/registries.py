@@ -1,8 +1,7 @@
 """Registries of extensions: formats, exports, detectors, noise models, planner arms; optional libraries.
 
-Each is found through an entry point, so adding one takes one module and one line in a pyproject.toml,
-in this package or in the user's own. An entry point names an object that has the protocol defined here.
-Where an extension needs an optional library that is missing, the error gives the command that installs it.
+Each is found through an entry point, which names an object that has the protocol defined here. Where an
+extension needs an optional library that is missing, the error gives the command that installs it.
 """
 
 from __future__ import annotations
@@ -287,7 +286,7 @@ class Export(Protocol):
         """Write into an existing empty folder and return the paths written, sorted.
 
         What is held, moved or thinned out is counted in a note to `recording.progress`. DataError if there is
-        nothing to write.
+        nothing.
         """
 
 

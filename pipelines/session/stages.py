@@ -1,17 +1,14 @@
 """Stages of a session: begin under a lock, resume after an interrupt, publish completely or not at all.
 
-The code of a stage looks like this:
+    with locked(folder) as session:
+        run = session.begin(RECONSTRUCT, settings=settings, inputs=hashes)
+        if run.finished:
+            return run.record
+        write_table(run.folder / "skeleton.parquet", skeleton, SKELETON)
+        return run.publish(counts=counts, warnings=warnings)
 
-with locked(folder) as session:
-    run = session.begin(RECONSTRUCT, settings=settings, inputs=hashes)
-    if run.finished:
-        return run.record
-    rays = run.chunk("rays", produce_rays)
-    write_table(run.folder / "skeleton.parquet", skeleton, SKELETON)
-    return run.publish(counts=counts, warnings=warnings)
-
-`stage.json` records of what a stage was made. `run.json` is the only file that differs from run to run: it
-holds run times, the versions of libraries, and the stamps of sources.
+`stage.json` records of what a stage was made. `run.json`, with run times, versions and stamps of sources, is
+the only file that differs from run to run.
 """
 
 from __future__ import annotations
@@ -101,8 +98,7 @@ def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, st
 def outdated(records: Mapping[str, StageRecord], recorded: Mapping[str, str]) -> list[str]:
     """List the stages of which something that they were made of has changed since.
 
-    `recorded` are the hashes of the recordings (`Description.recorded`); inputs that no stage made do not
-    count.
+    `recorded` are the hashes of the recordings (`Description.recorded`).
     """
     made = {**recorded, **{stage: record.key for stage, record in records.items()}}
     for record in records.values():
@@ -252,10 +248,9 @@ class Session:
         return read_record(path) if path.exists() else None
 
     def intact_record(self, stage: str) -> StageRecord | None:
-        """Return the record of a stage after checking that all of its files are as the stage wrote them.
+        """Return the record of a stage if all of its files are as it wrote them; None if it never finished.
 
-        None if the stage was never finished. DataError if a file is gone or has another content, or the
-        record is damaged or of a later version.
+        DataError if a file is gone or has another content, or the record is damaged or of a later version.
         """
         record = self.record(stage)
         if record is None:
@@ -306,11 +301,9 @@ class WritableSession(Session):
     ) -> Run:
         """Begin a stage, or find it finished with the same settings and inputs, and undamaged.
 
-        Args:
-            settings: everything that determines the result, with defaults filled in; no paths, no thread
-                counts.
-            inputs: the SHA-256 of everything read, by a name that is the same on every machine.
-            force: run it again, from the start.
+        `settings` are everything that determines the result, without paths or thread counts; `inputs` the
+        SHA-256 of everything read, by a name that is the same on every machine. `force` runs it again, from
+        the start.
         """
         key = key_of(stage, settings, inputs)
         before = usable_record(self.folder / stage.name / "stage.json")
@@ -333,13 +326,10 @@ class WritableSession(Session):
 
 
 class Run:
-    """One run of a stage.
+    """One run of a stage, which writes into `folder`.
 
-    Attributes:
-        folder: where the stage writes; it becomes the stage, of ingest the session's own files, when
-            published.
-        finished: True if nothing is to be done; `record` then describes the existing result.
-        replaces: settings that differ from the earlier run's: name to (before, now); absent ones are None.
+    `finished`: nothing is to be done, and `record` describes the existing result. `replaces`: settings that
+    differ from the earlier run's, name to (before, now).
     """
 
     def __init__(
@@ -378,10 +368,7 @@ class Run:
         return self._record
 
     def chunk(self, name: str, produce: Callable[[Path], None]) -> Path:
-        """Return the folder of a finished part of a long stage; call `produce` if no earlier run finished it.
-
-        Parts are stored by the stage's key. `produce` writes into the empty folder that it gets.
-        """
+        """Return the folder of a finished part of a stage; call `produce` if no earlier run finished it."""
         return finished_part(self._chunks / name, produce)
 
     def has_chunk(self, name: str) -> bool:
@@ -431,7 +418,7 @@ def session_name(folder: Path) -> str:
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """Return the name of each flight or session: that of its file, or of the folder around a `flight.yaml`.
+    """Return the name of each flight or session, that of its file or of the folder around a `flight.yaml`.
 
     DataError if two have the same name.
     """
@@ -475,11 +462,8 @@ def refuse_no_session(folder: Path) -> None:
 def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> Iterator[WritableSession]:
     """Lock a session for writing; leftovers of a killed writer are completed or removed first.
 
-    An exception inside leaves every stage as it was. Errors of the operating system become DataError.
-
-    Args:
-        create: allow a folder that does not exist yet (ingest); if the ingest fails, a new folder is removed.
-        overwrite: with `create`, write also into a folder with other files in it, which stay.
+    An exception inside leaves every stage as it was. `create` allows a folder that does not exist yet (if the
+    ingest fails, it is removed), and with `overwrite` one with other files in it, which stay.
 
     DataError: not a session, or with `create` something else; of a later version; cannot be written.
     BusyError: another process holds it.
@@ -635,7 +619,7 @@ _ORIGIN = "copied_from.json"
 def copy_session(folder: Path, target: Path) -> None:
     """Copy a session, so that stages can run on the copy; its videos stay where they are.
 
-    A target that is a copy of this session stays as it is, with what was made in it; any other is refused.
+    A target that is a copy of this session stays as it is; any other is refused.
     """
     record = open_session(folder).ingested()
     try:

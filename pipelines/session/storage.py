@@ -1,15 +1,7 @@
 """Files and folders that survive a kill, reproducible JSON, hashes of files, locks.
 
-A folder of results appears complete or not at all; its finished parts survive an interrupt:
-
-    with whole_folder(target, key, mark=mark, overwrite=overwrite) as making:
-        video = making.part("drone1-0", encode)
-        ...
-        (making.folder / "flight.yaml").write_text(...)
-        making.publish()
-
-Everything is written in a hidden folder beside the target, which is renamed to the target at the end. Parts
-are stored by key, so a run with other settings does not use them.
+`whole_folder` makes a folder that appears complete or not at all: it is written in a hidden folder beside the
+target. Its finished parts are stored by key and survive an interrupt.
 """
 
 import codecs
@@ -122,8 +114,7 @@ def text_encoding(content: bytes) -> str:
 def plain_text(content: bytes, errors: str = "replace") -> str:
     r"""Decode UTF-8, or UTF-16 that begins with its mark, without the mark and with lines ending in "\n".
 
-    UnicodeDecodeError for bytes that are no such text, with `strict`; `replace` makes them signs that no
-    number contains.
+    UnicodeDecodeError for bytes that are no such text, with `strict`; else they become signs of no number.
     """
     return content.decode(text_encoding(content), errors).replace("\r\n", "\n").replace("\r", "\n")
 
@@ -349,10 +340,7 @@ _OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session
 
 @contextmanager
 def held(lock: Path, target: Path | str) -> Iterator[None]:
-    """Hold a lock of the kernel, which ends with the process; BusyError if another process has it.
-
-    The holder's process id is in a file of its own, because some versions of filelock empty the lock file.
-    """
+    """Hold a lock of the kernel, which ends with the process; BusyError if another process has it."""
     holder = lock.with_name(f"{lock.name}.pid")
     drop_link(lock)
     try:
@@ -439,8 +427,8 @@ class Making:
 def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Iterator[Making]:
     """Make a folder. Parts are kept after an interrupt, and removed after success or a DataError.
 
-    `key` is equal for equal results. A target without the file `mark` holds something else, and is replaced
-    only with `overwrite`, else a DataError. BusyError if another process makes the same folder.
+    `key` is equal for equal results. A target without the file `mark` is replaced only with `overwrite`, else
+    a DataError. BusyError if another process makes the same folder.
     """
     target = target.absolute()
     _check(target, mark, overwrite)
@@ -467,10 +455,7 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
 
 
 def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
-    """Refuse, with a DataError, to replace a session or a part of one, even with `overwrite`.
-
-    The target must not hold a session or a stage of one at any depth, nor lie in one.
-    """
+    """Refuse, with a DataError, to replace a session, a folder that holds one, or a part of one."""
     target = target.absolute()
     if not target.is_dir():
         return
@@ -517,3 +502,27 @@ def _put_back(work: Path, target: Path) -> None:
     if old.exists() and not target.exists():
         old.rename(target)
     remove_tree(old)
+
+
+# --- errors that readers share -------------------------------------------------------------------------
+
+AGAIN = "copy it again, or export it again"
+
+
+def damaged(source: Path | str, problem: object) -> DataError:
+    """Make the error of a file whose content contradicts itself; an exception of a library is quoted."""
+    if isinstance(problem, OSError):
+        return as_data_error(problem, Path(source))
+    if not isinstance(problem, str):
+        problem = f"is damaged ({' '.join(str(problem).split())[:100] or type(problem).__name__})"
+    return DataError(source, problem, AGAIN, code="damaged")
+
+
+def bad_value(source: Path | str, problem: str) -> DataError:
+    """Make the error of a value that is not of the expected kind."""
+    return DataError(source, problem, AGAIN, code="bad-value")
+
+
+def empty(source: Path | str, problem: str) -> DataError:
+    """Make the error of a file without content."""
+    return DataError(source, problem, AGAIN, code="empty")

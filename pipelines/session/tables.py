@@ -1,8 +1,7 @@
 """The columns of every table of a session, and the conversion of records to rows and back.
 
-The files are plain Parquet that pandas reads without this program. The same frame gives the same bytes: no
-index, no pandas metadata, fixed writer settings. A table has one row per measurement. A joint that was not
-found has no row, and is read back as NaN.
+The files are plain Parquet: no index, no pandas metadata, and the same bytes for the same frame. A joint that
+was not found has no row, and is read back as NaN.
 """
 
 from __future__ import annotations

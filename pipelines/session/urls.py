@@ -1,7 +1,6 @@
 """Places that are named by URL: sources are fetched into the user's cache, sessions are uploaded when done.
 
-A URL is one that fsspec opens (`s3://bucket/flight/drone1.mp4`). A session at a URL is worked on in a copy on
-this machine's disk, which is uploaded once, at the end.
+A session at a URL of fsspec is worked on in a copy on this machine, which is uploaded once, at the end.
 Credentials come from where the store's own library looks for them, never from a URL, and no message repeats
 what a store says.
 """
@@ -51,8 +50,8 @@ T = TypeVar("T")
 def url_of(place: Path | str) -> str | None:
     """Return the URL that a place is; None for a place on this machine, also for a path that exists.
 
-    A URL that has become a Path has lost one of its two slashes. DataError if the URL holds a secret, which
-    results and messages would repeat, or is of a kind that is not fetched.
+    A URL that has become a Path has lost one of its slashes. DataError if it holds a secret or is not
+    fetched.
     """
     text = str(place)
     found = _URL.fullmatch(text)
@@ -201,9 +200,8 @@ def _refuse_full_disk(folder: Path, size: int, url: str) -> None:
 def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
     """Yield the folder of a session; one at a URL is copied here, and uploaded whole if it changed.
 
-    After an error nothing is uploaded. What was made stays in the copy, and the same command continues.
-    `create` allows a URL at which there is no session yet. BusyError if another process of this machine works
-    on it.
+    After an error nothing is uploaded; what was made stays in the copy, and the same command continues.
+    `create` allows a URL without a session. BusyError if another process of this machine works on it.
     """
     url = url_of(place)
     if url is None:

@@ -27,17 +27,10 @@ def read_yaml_model(
     shape: str,
     made: str = "",
 ) -> M:
-    """Read and validate a file.
+    """Read and validate a file; one DataError holds every problem that was found.
 
-    Args:
-        model: the model of its content; the schema's version is the value of the key `schema`.
-        noun: the name of such a file ("flight manifest").
-        newest: the newest version of the schema.
-        shape: a description of the file's form, for the message if the file is no mapping.
-        made: how one is made, for the message if the file is another one.
-
-    DataError: the file is missing, no YAML, or does not keep to the schema; the message holds every problem
-    that was found.
+    `newest` is the newest value of the key `schema`. `noun` ("flight manifest"), `shape` (the file's form)
+    and `made` (how one is made) are for messages.
     """
     how = f" ({made})" if made else ""
     raw = plain_yaml(path, read_text(path, most_bytes=MAX_FILE_BYTES))

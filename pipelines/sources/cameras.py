@@ -42,12 +42,7 @@ TriggerTimes = Callable[[FrameTimes], Int64 | None]
 
 
 class FlightCameras:
-    """Reader of the frame times and the intrinsics of one flight.
-
-    Args:
-        triggers: reads trigger times from a drone's own log.
-        note: receives each choice and each doubt, one line each.
-    """
+    """Reader of frame times and intrinsics; `triggers` reads the times of a drone's own log."""
 
     def __init__(
         self,
@@ -71,9 +66,9 @@ class FlightCameras:
     ) -> CameraFrames:
         """Read the time at which each picture was taken.
 
-        The source is the one that the manifest states: `fps` from `start` on, a file or topic of frame times,
-        the stamps of pictures in a log, or the container's own stamps from `start` on. The offset of the
-        camera's clock is added. DataError: there is no source of frame times, or it is unusable.
+        It is `fps` from `start` on, a file or topic of frame times, the stamps of pictures in a log, or the
+        container's own stamps from `start` on, as the manifest states, and the offset of the camera's clock.
+        DataError: there is no source of frame times, or it is unusable.
         """
         offset_ns = camera.clock.offset_ns if camera.clock else 0
         unclocked = self._unclocked_frames(name, camera, video, detections)

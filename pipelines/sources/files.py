@@ -98,11 +98,7 @@ class FlightFiles:
         return options_of(where, part, self.format_of(part, source), source.options, wanted)
 
     def refuse_other_options(self) -> None:
-        """Recognise every file.
-
-        DataError: a file does not exist, is of no kind that belongs where it stands, or has options or a
-        topic that such a file does not take.
-        """
+        """Recognise every file; DataError for a missing one, a wrong kind, or options not for it."""
         parts: list[tuple[str, str, FileSource | None]] = []
         for name, camera in self._flight.cameras.items():
             named = ("video", "frame_times", "pose", "gimbal", "intrinsics", "keypoints")

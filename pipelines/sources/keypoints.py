@@ -99,11 +99,7 @@ def doubt_numbers(detections: Detections, frames: CameraFrames, *, from_video: b
 def unmirrored(detections: Detections, mirrored: bool | str, intrinsics: Intrinsics) -> Detections:
     """Undo that keypoints were found in mirrored pictures.
 
-    Args:
-        detections: as the file has them.
-        mirrored: True, or of what: "x" alone counts from the right, "y" from below, or "names" alone have
-            left for right.
-        intrinsics: of the pictures.
+    `mirrored`: True, or "x" alone counts from the right, "y" from below, "names" alone have left for right.
     """
     if mirrored in (True, "x"):
         xy = detections.xy.copy()

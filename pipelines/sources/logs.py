@@ -1,7 +1,6 @@
 """Readers of the parts that a manifest takes from logs: the recording, the topic, and its content.
 
-If no topic is stated, the only candidate of its kind is taken, and a note names it. Every reading
-is one pass over the messages of one topic: logs of any size stream.
+If no topic is stated, the only candidate of its kind is taken, and a note names it.
 """
 
 from collections import Counter
@@ -151,14 +150,7 @@ class FlightLog:
 
 
 class FlightLogs:
-    """Logs of one flight; a context manager that closes those that it keeps open.
-
-    Logs of our own formats stay open between readings, within bounds, so that their indices are read once.
-
-    Args:
-        base: the folder that its paths are relative to.
-        note: receives each choice and each doubt, one line each.
-    """
+    """Logs of one flight; a context manager that closes those that it keeps open, within bounds."""
 
     def __init__(self, flight: Manifest, base: Path, note: Callable[[str], None]) -> None:
         self._flight = flight
@@ -353,8 +345,8 @@ def maps_of_log(
 ) -> LoggedMaps:
     """Read the maps of a topic, in ENU axes at world times.
 
-    DataError: no such topic, several candidates, no readable map, or a map in a frame that the log does not
-    connect with its world.
+    DataError: no such topic, several, no readable map, or a map in a frame that nothing connects with the
+    world.
     """
     log, options = stated.file, LoggedMap.model_validate(stated.options)
     with logs.open(log) as opened:

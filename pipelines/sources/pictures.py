@@ -56,11 +56,9 @@ def open_files(paths: list[Path], topic: str | None, stamps: str) -> CameraPictu
 
 
 def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:
-    """Refuse pictures that differ from those that were ingested.
+    """Refuse, with a DataError, pictures with other content than those that were ingested.
 
-    A file with the size and the time of change that ingest noted is taken to be the same. The content of any
-    other file is hashed, so copies pass. Missing files pass too; opening them fails later. DataError: a file
-    has other content than the one that was ingested.
+    A file with the noted size and time of change is the same; any other is hashed. Missing files pass.
     """
     noted = noted_stamps(session, description.sources)
     for camera in cameras:

@@ -113,9 +113,8 @@ class Origin:
 class FlightPoses:
     """Reader of the poses of one flight, in the world's axes and at its times.
 
-    Args:
-        max_gap_ns: the longest gap between two poses or angles that is interpolated.
-        note: receives each choice and each doubt, one line each.
+    Gaps of more than `max_gap_ns` between two poses or angles are not interpolated. `note` receives each
+    choice and each doubt, one line each.
     """
 
     def __init__(
@@ -145,16 +144,10 @@ class FlightPoses:
     # --- cameras ---------------------------------------------------------------------------------------
 
     def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames) -> Trajectory:
-        """Read world_from_camera over time; a static camera has one row, at its first frame.
+        """Read world_from_camera over time; a static camera has one row, at the first of its frames.
 
-        With `attitude: pictures` only the positions have a meaning.
-
-        Args:
-            name: name of the camera.
-            camera: its description.
-            frames: times of its pictures.
-
-        DataError: nothing usable, or the manifest does not state the camera's mount on the body.
+        With `attitude: pictures` only the positions have a meaning. DataError: nothing usable, or the
+        manifest does not state the camera's mount on the body.
         """
         pose = camera.pose
         if pose.by_pictures:
@@ -226,10 +219,7 @@ class FlightPoses:
         return isinstance(self._files.format_of("pose", pose), TelemetryFormat)
 
     def refuse_unfit(self) -> None:
-        """Refuse poses, mounts and gimbals that do not go together, for the kind of file that each one is.
-
-        DataError: the camera cannot be meant so.
-        """
+        """Refuse, with a DataError, poses, mounts and gimbals that do not go together."""
         for name, camera in self._flight.cameras.items():
             place = f"{self._manifest}: cameras.{name}"
             for problem, remedy in (*self._unfit_pose(camera), *self._unfit_gimbal(camera)):
@@ -600,10 +590,9 @@ class FlightPoses:
     # --- the origin ------------------------------------------------------------------------------------
 
     def origin(self) -> Origin | None:
-        """Return the world's origin: the stated one, or the first position on Earth of the first camera.
+        """Return the world's origin: the stated one, else the first position on Earth of the first camera.
 
-        None if no camera has a position on Earth and no CRS is stated. The origin's height is 0 if that
-        camera's heights count from the take-off (or are stated): these do not give the height of the ground.
+        Its height is 0 if that camera's heights count from the take-off or are stated. None without either.
         """
         if self._origin is not None:
             return self._origin

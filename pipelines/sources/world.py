@@ -83,13 +83,7 @@ def moved(
     scale: float = 1.0,
     new_from_old_body: Float | None = None,
 ) -> Trajectory:
-    """Change the axes of poses: scale, turn and shift the world, and turn the axes of the body itself.
-
-    Args:
-        turn: [4] or [N, 4] new from old world.
-        shift: [3] or [N, 3] m, the old origin in the new world.
-        new_from_old_body: [4].
-    """
+    """Change the axes of poses: scale, turn and shift (m) the world, and turn the body's own axes."""
     position, quaternion = scale * trajectory.position, trajectory.quaternion_xyzw
     covariance, body = trajectory.covariance, trajectory.body_xyzw
     if turn is not None:
@@ -144,13 +138,8 @@ def turn_of(place: Placement) -> Float:
 def refuse_projected(source: Path | str, position: Float, origin: Place, crs: str = "") -> None:
     """Refuse coordinates of a map projection, such as UTM, in a world whose origin on Earth is known.
 
-    Args:
-        source: for the message.
-        position: [N, 3] m in the world; rows of NaN are ignored.
-        origin: the world's.
-        crs: name of the CRS that placed them in the world, if one did.
-
-    DataError: the median position is more than 100 km from the origin.
+    `crs` names the one that placed them, if one did. DataError: the median is more than 100 km from the
+    origin.
     """
     across = position[np.isfinite(position[:, :2]).all(axis=1), :2]
     if not len(across):

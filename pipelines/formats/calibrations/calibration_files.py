@@ -19,11 +19,10 @@ from pipelines.formats.calibrations.camera_matrices import (
     unstated_size,
 )
 from pipelines.formats.common.files import numbers, read_head, read_yaml
-from pipelines.formats.common.refusals import bad_value, damaged, empty
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
-from pipelines.session.storage import read_text
+from pipelines.session.storage import bad_value, damaged, empty, read_text
 
 Cameras = dict[str, CalibratedCamera]
 

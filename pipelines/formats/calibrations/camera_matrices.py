@@ -1,7 +1,7 @@
 """Checked conversion of camera matrices, Rodrigues vectors and camera_from_world poses to our records.
 
-A matrix counts pixels as we do, the centre of the top left one at (0, 0), which is OpenCV's convention.
-Readers of files that count otherwise (COLMAP) shift (cx, cy) before.
+The centre of the top left pixel is (0, 0), as in OpenCV; readers of other files (COLMAP) shift (cx, cy)
+before.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.refusals import damaged
 from pipelines.geometry.arrays import DistortionModel, Float, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
+from pipelines.session.storage import damaged
 
 # OpenCV's further coefficients (thin prism, tilt) are rare and mostly zero.
 _MOST_COEFFICIENTS = 8

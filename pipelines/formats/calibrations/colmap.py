@@ -2,8 +2,7 @@
 
 pycolmap reads on behind the end of a damaged file, for ever or into wrong numbers. So it runs in a process of
 its own with limits of time and memory, and writes the model again: what was read whole has the same size.
-
-COLMAP puts (0, 0) at the corner of the top left pixel, we at its centre: cx and cy lose half a pixel.
+COLMAP puts (0, 0) at the corner of the top left pixel: cx and cy lose half a pixel.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.calibrations.camera_matrices import build_intrinsics, describe_cameras, invert_pose
-from pipelines.formats.common.refusals import damaged
 from pipelines.geometry.arrays import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
+from pipelines.session.storage import damaged
 
 # A small model takes a second of processor time, nearly all of it to import pycolmap.
 READING_CPU_S = 3
@@ -63,8 +62,7 @@ _MODELS = {
 class ColmapModel:
     """Reader of COLMAP models: one camera for each image, named after it without folder and suffix.
 
-    If two images would get one name (cam1/000.jpg, cam2/000.jpg), all images of that name keep
-    their folder: "cam1/000", "cam2/000".
+    Images that would get one name (cam1/000.jpg, cam2/000.jpg) keep their folder: "cam1/000", "cam2/000".
     """
 
     name = "colmap"

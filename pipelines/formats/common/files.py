@@ -6,10 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.refusals import bad_value, damaged
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, is_special, plain_text, read_text, refuse_special
+from pipelines.session.storage import (
+    as_data_error,
+    bad_value,
+    damaged,
+    is_special,
+    plain_text,
+    read_text,
+    refuse_special,
+)
 from pipelines.session.yaml_files import plain_yaml
 
 HEAD_BYTES = 64 * 1024

@@ -64,9 +64,9 @@ def parse_table(
 ) -> TextTable:
     """Read delimited rows of `columns` cells; blank lines and lines that begin with # are skipped.
 
-    A last line that does not parse is left out and counted in `truncated`. Where commas do not separate cells
-    and the first row has no dot but in a date, commas before digits are decimal. `text` and `numbers` map
-    names to columns; blank and "nan" are NaN.
+    A last line that does not parse is counted in `truncated`. Where commas do not separate cells and the
+    first row has no dot but in a date, commas before digits are decimal. `text` and `numbers` map names to
+    columns; blank and "nan" are NaN.
     """
     import pyarrow as pa
 
@@ -147,10 +147,9 @@ def parse_stamps(
 ) -> tuple[Int64, Bool]:
     """Parse decimal stamps [N] as nanoseconds, rounded to the nearest (halves away from zero).
 
-    No float stands between: a float64 holds 1700000000.123456789 s only to 0.2 us. The result is 0 where the
-    second array is False: the text is no finite number that int64 nanoseconds can hold. If the file does not
-    state its unit, stamps after the year 2262 are read in the unit in which they are not. Dates with times by
-    ISO 8601 are read whatever the unit; without a zone they are UTC.
+    The result is 0 where the second array is False: the text is no finite number that int64 nanoseconds can
+    hold. If the file does not state its unit, stamps after the year 2262 are read in the unit in which they
+    are not. Dates with times by ISO 8601 are read whatever the unit; without a zone they are UTC.
     """
     cells = texts if isinstance(texts, Sequence) else texts.to_pylist()
     t_ns, readable = np.zeros(len(cells), np.int64), np.zeros(len(cells), np.bool_)
@@ -311,9 +310,8 @@ def _plain_name(cell: str) -> str:
 def stamp_column(header: Sequence[str]) -> tuple[int, int] | None:
     """Find the time column and its unit: t, time, timestamp or stamp, with _ns or [ns] and so on.
 
-    A heading without a unit means seconds. If there are several columns, the finest unit is taken. A table of
-    `rostopic echo -p` has `field.header.stamp`, else `%time`, in ns. Without any of them, `sec` beside
-    `nanosec` counts.
+    Of several the finest unit is taken. A table of `rostopic echo -p` has `field.header.stamp`, else `%time`,
+    in ns. Without any of them, `sec` beside `nanosec` counts.
     """
     if (whole := _whole_stamp(header)) is not None:
         return whole
@@ -354,8 +352,7 @@ def kept_rows(
 ) -> Bool:
     """Mark the usable rows [N]; count the others in `dropped` under the first cause that applies.
 
-    After `causes` come "duplicate stamp" (the first stays) and "stamp out of order", behind `prefix`: the
-    longest chain of rising stamps is kept, so that one wrong stamp costs one row.
+    After `causes` come "duplicate stamp" (the first stays) and "stamp out of order", behind `prefix`.
     """
     keep = np.ones(len(t_ns), dtype=np.bool_)
     for cause, bad in causes.items():

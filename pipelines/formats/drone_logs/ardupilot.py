@@ -1,7 +1,6 @@
 """ArduPilot's DataFlash logs (.bin), by pymavlink (extra `drones`): estimates, GPS, mounts and pictures.
 
-pymavlink finds the messages, also behind damaged bytes. Their numbers are then read in one step for each
-name. ArduPilot's world is NED, its body FRD, and its stamps count microseconds since boot (docs/formats.md).
+pymavlink finds the messages, also behind damaged bytes. The world is NED, stamps are us since boot.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     Boots,
     DroneLog,
@@ -41,6 +39,7 @@ from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
+from pipelines.session.storage import damaged
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log
 # A log defines up to 256 types, and chance makes one definition in 16 MB.
@@ -150,8 +149,7 @@ class ArduPilotFormat(DroneLog):
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position, attitude and mount.
 
-        The position is POS (`global`), else that of the estimator XKF1 or NKF1 (`local`, metres from ORGN),
-        else GPS.
+        The position is POS (`global`), else XKF1 or NKF1 (`local`, metres from ORGN), else GPS.
         """
         log = _DataFlash(path)
         dropped: dict[str, int] = {}

@@ -1,13 +1,9 @@
 """DJI's flight records as the CSV that log services export.
 
-The record is the only place where most consumer drones log their gimbal's angles. The CSV has the columns
-that the exporting service chose, in feet or metres, often in both. Known are those of Airdata
-(`time(millisecond),datetime(utc),latitude,...,height_above_takeoff(feet),...,gimbal_pitch(degrees)`), of
-Flight Reader (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBAL.pitch`), PhantomHelp
-(`Time(seconds),...,Altitude(feet),Altitude(meters),...,Pitch,Roll,Yaw`) and dji-log-parser
-(`CUSTOM.dateTime,OSD.flyTime,OSD.latitude`).
-
-Angles are those of an FRD body and gimbal in NED (docs/formats.md).
+Columns are those of Airdata (`time(millisecond),datetime(utc),latitude,...,gimbal_pitch(degrees)`), Flight
+Reader (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBAL.pitch`), PhantomHelp
+(`Time(seconds),...,Altitude(feet),...,Pitch,Roll,Yaw`) and dji-log-parser (`CUSTOM.dateTime,...`), in feet or
+metres, often both. Angles are those of an FRD body and gimbal in NED.
 """
 
 from __future__ import annotations
@@ -24,7 +20,6 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.refusals import empty
 from pipelines.formats.drone_logs.dji_subtitles import (
     DjiRows,
     any_finite,
@@ -36,7 +31,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import as_data_error, refuse_special, text_encoding
+from pipelines.session.storage import as_data_error, empty, refuse_special, text_encoding
 
 _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
 # No flight lasts twelve days, so a larger time is damage.
@@ -265,12 +260,8 @@ def _read(path: Path) -> _Record:
     refuse_special(path)
     heading = _find_heading(read_head(path))
     if heading is None:
-        raise DataError(
-            path,
-            "has no heading that names times, latitude, longitude, and heights or angles",
-            "export the flight record with these columns",
-            code="missing-column",
-        )
+        problem = "has no heading that names times, latitude, longitude, and heights or angles"
+        raise DataError(path, problem, "export the flight record with these columns", code="missing-column")
     values: dict[str, list[float]] = {name: [] for name in heading.numbers}
     clocks: list[str] = []
     filming: list[bool] = []

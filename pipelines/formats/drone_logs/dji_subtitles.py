@@ -1,16 +1,12 @@
 """Reader of DJI's subtitles, which log the drone's position and the gimbal's angles beside the video.
 
-Generations have only the form of subtitles in common. All of these are read:
+Three generations, with angles of an FRD body and gimbal in NED:
 
 - `[latitude: 41.4] [longitude: 2.2] [rel_alt: 3.6 abs_alt: 6.4] [gb_yaw: 30.0 gb_pitch: -45.0 gb_roll: 0.0]`
-  (since 2018). Blanks before the colons are optional; some drones spell `longitude` as `longtitude`. Only
-  enterprise models log gimbal angles. Some log one height called `altitude`, without its reference (for a
-  Mavic Air 2 it is the take-off);
+  (since 2018); `longitude` may be spelled `longtitude`, and the height `altitude`, without its reference;
 - `GPS(149.0251,-20.2533,16)`: longitude, latitude, satellites (until 2018), with `Hb:1.9`, `BAROMETER:20.1`
   or `H 85.80m` as height above take-off, and `F.PRY (...)`, `G.PRY (...)` as the angles of body and gimbal;
 - `GPS(36.6146,-6.1120,0.0M)`: latitude, longitude, height (Matrice 300): the M tells them apart.
-
-Angles are those of an FRD body and gimbal in NED (docs/formats.md).
 """
 
 from __future__ import annotations
@@ -24,7 +20,6 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.refusals import empty
 from pipelines.formats.common.rows import longest_rising
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
@@ -40,7 +35,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, AttitudeTrack, Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import code_of, plain_text
+from pipelines.session.storage import code_of, empty, plain_text
 
 # DJI's drones fly no higher than this above their take-off.
 _HIGHEST_M = 500
@@ -107,12 +102,8 @@ def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
         found.names[1], found.t_ns[found.timed], found.gimbal[found.timed], dropped, rows=found.rows
     )
     if camera is None:
-        raise DataError(
-            path,
-            "holds no gimbal angles",
-            "name the log and topic that do, or fixed angles",
-            code="no-attitude",
-        )
+        problem = "holds no gimbal angles"
+        raise DataError(path, problem, "name the log and topic that do, or fixed angles", code="no-attitude")
     return Attitudes(replace(camera, dropped=dropped), found.clock)
 
 
@@ -121,11 +112,8 @@ def choose_height(
 ) -> tuple[Float, Height, str]:
     """Choose the height of each position; return it with its reference and a note about the choice.
 
-    Args:
-        path: the file, for messages.
-        columns: [N] m: `relative` to the take-off, `absolute`, and `altitude` without a reference, which is
-            used for each of the two that has no column of its own. NaN where there is none.
-        choice: the user's choice.
+    `columns` [N] m are `relative` to the take-off, `absolute`, and `altitude` without a reference, which is
+    used for each of the two that has no column of its own; NaN where there is none.
     """
     stated, unnamed = choice.altitude, columns["altitude"]
     if isinstance(stated, int | float):
@@ -135,12 +123,8 @@ def choose_height(
     named = {name: columns[name] for name in both if any_finite(columns[name])}
     there = (dict.fromkeys(both, unnamed) if any_finite(unnamed) else {}) | named
     if not there:
-        raise DataError(
-            path,
-            "holds no height",
-            "state it, in metres above the take-off: pose: {file: ..., altitude: 30}",
-            code="no-positions",
-        )
+        remedy = "state it, in metres above the take-off: pose: {file: ..., altitude: 30}"
+        raise DataError(path, "holds no height", remedy, code="no-positions")
     if stated is not None and stated not in there:
         raise DataError(
             path, f"holds no {stated} height", f"write altitude: {next(iter(there))}, or the metres"
@@ -170,10 +154,9 @@ def angles_track(
     *,
     rows: str = "subtitles",
 ) -> AttitudeTrack | None:
-    """Build the attitude from angles [N, 3]; None if there are none.
+    """Build the attitude from angles [N, 3]; None if there are none. `rows` names the rows for losses.
 
-    An angle that is repeated until the next measurement is replaced by linear interpolation. `rows` names
-    the rows of the file where losses are counted.
+    An angle that is repeated until the next measurement is replaced by linear interpolation.
     """
     stated = np.isfinite(yaw_pitch_roll_deg).all(axis=1)
     if not stated.any():
@@ -248,8 +231,8 @@ class Subtitles:
     def times(self) -> tuple[Int64, Bool]:
         """Return the time at which each subtitle was written [B], and True if that is known [B].
 
-        Subtitles of each frame: the time on their clock. Slow ones show whole seconds, so the video's own
-        time is added to the clock time of its start. Without any clock it is the video's own time.
+        Slow subtitles show whole seconds, so the video's own time is added to the clock time of its start.
+        Without any clock it is the video's own time.
         """
         start_ns = self.start_ns()
         if start_ns is None:

@@ -1,13 +1,11 @@
 """GoPro's telemetry track (GPMF) inside a video: positions by GPS, and a Karma drone's own flight data.
 
 Layout (GoPro, "GPMF Introduction"): key of four letters, type, size of a structure, number of structures,
-then big-endian values padded to four bytes; type 0 holds further items. `DEVC` is a device, `STRM` one of
-its streams, in which `SCAL` divides the values, and `TYPE` lists the types of a structure of type `?`.
-
-- `GPS5` (latitude, longitude, height, two speeds), with the UTC `GPSU` and fix `GPSF` of each packet;
-  `GPS9` (since Hero 11) has the time and the fix in each row. Rows of a packet are evenly spaced.
-- A Karma logs `GLPI` (position), `ATTD` (roll, pitch, yaw, as MAVLink counts them) and `SYST` (time since
-  boot and UTC). What its `CYTS` means for the gimbal is not public.
+then big-endian values padded to four bytes; type 0 holds further items. `DEVC` is a device, `STRM` a stream,
+in which `SCAL` divides the values, and `TYPE` lists the types of a structure of type `?`. `GPS5` (latitude,
+longitude, height, two speeds) has the UTC `GPSU` and fix `GPSF` of its packet, `GPS9` in each row; rows of a
+packet are evenly spaced. A Karma logs `GLPI` (position), `ATTD` (roll, pitch, yaw, as MAVLink) and `SYST`
+(boot, UTC).
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
     attitude_track,
@@ -37,6 +34,7 @@ from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
+from pipelines.session.storage import damaged
 
 _KINDS = {
     "b": "i1",

@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.common.rows import NORM_TOLERANCE, describe_times, kept_rows
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place, RelativeTo
 from pipelines.geometry.clocks import fit_clock
@@ -22,6 +21,7 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, Height, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice
+from pipelines.session.storage import damaged
 
 # Late messages scatter GPS times by less.
 _UNEVEN_S = 0.5
@@ -329,12 +329,8 @@ def on_gps_time(
 ) -> ClockFit | None:
     """Return the fit to GPS time if it exists and the user did not ask for time since boot; else None."""
     if wanted == "gps" and fit is None:
-        raise DataError(
-            source,
-            "holds no GPS time",
-            "leave time: gps out; its stamps count from boot",
-            code="clock-unknown",
-        )
+        problem, remedy = "holds no GPS time", "leave time: gps out; its stamps count from boot"
+        raise DataError(source, problem, remedy, code="clock-unknown")
     if fit is None:
         notes.append("holds no GPS time: its stamps count from boot")
         return None

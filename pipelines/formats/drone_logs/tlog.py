@@ -1,9 +1,8 @@
 """Ground stations' telemetry logs (.tlog): MAVLink packets, each behind the station's clock.
 
-Layout: 8 bytes of microseconds since 1970 (big endian), then one packet of MAVLink 1 or 2. Definitions of the
-messages come from pymavlink (extra `drones`); packets are found here, by their checksums, also behind damaged
-bytes. Position, attitude and gimbal become the columns of PX4's topics, which both autopilots share. Pictures
-are timed by the camera's own message (CAMERA_FEEDBACK) or by the trigger (CAMERA_TRIGGER).
+Layout: 8 bytes of microseconds since 1970 (big endian), then one packet of MAVLink 1 or 2, found here by its
+checksum, also behind damaged bytes; pymavlink (extra `drones`) knows the messages. Position, attitude and
+gimbal become the columns of PX4's topics. Pictures are timed by CAMERA_FEEDBACK or by CAMERA_TRIGGER.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     Boots,
     DroneLog,
@@ -38,6 +36,7 @@ from pipelines.geometry.clocks import fit_clock
 from pipelines.session.errors import DataError
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice, need
+from pipelines.session.storage import damaged
 
 # The station's clock takes this many bytes before each packet.
 _STAMP = 8
@@ -98,8 +97,8 @@ class TlogFormat(DroneLog):
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position, attitude and gimbal of one vehicle; `instance` is its system's number.
 
-        The position is GLOBAL_POSITION_INT (`global`), else LOCAL_POSITION_NED (`local`), else GPS_RAW_INT.
-        Times are UTC by SYSTEM_TIME; without it, those of the station.
+        The position is GLOBAL_POSITION_INT, else LOCAL_POSITION_NED, else GPS_RAW_INT. Times are UTC by
+        SYSTEM_TIME; without it, those of the station.
         """
         log = _read(path)
         system = _vehicle(path, log, choice.instance, _POSITIONS)
@@ -123,8 +122,8 @@ class TlogFormat(DroneLog):
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
         """Read the times of pictures, ns [N], increasing: CAMERA_FEEDBACK, else CAMERA_TRIGGER.
 
-        Stamps since boot are turned to UTC as those of `read_telemetry`, also to the station's clock; stamps
-        that are UTC already stay. Pictures are assigned to stamps in order, so none may be lost between them.
+        Stamps since boot become UTC or the station's clock. Pictures are assigned in order, so none may be
+        lost.
         """
         log = _read(path)
         system = _vehicle(path, log, choice.instance, _PICTURES)
@@ -335,12 +334,8 @@ def _read(path: Path) -> _Packets:
     except (OSError, ValueError) as error:  # ValueError: an empty file cannot be mapped
         raise damaged(path, error) from error
     if not found.count:
-        raise DataError(
-            path,
-            "holds no packet of MAVLink",
-            "give the .tlog that the ground station wrote",
-            code="wrong-kind",
-        )
+        problem = "holds no packet of MAVLink"
+        raise DataError(path, problem, "give the .tlog that the ground station wrote", code="wrong-kind")
     return found
 
 

@@ -1,7 +1,7 @@
 """Reader of PX4's .ulg logs, by pyulog (extra `drones`): estimates, GPS, gimbal and camera triggers.
 
-PX4's world is NED, its body FRD, and its stamps count microseconds since boot (docs/formats.md). Definitions
-are checked before pyulog expands them: damaged or malicious ones mean billions of fields.
+The world is NED, stamps are us since boot. Definitions are checked before pyulog expands them: damaged or
+malicious ones mean billions of fields.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
     attitude_track,
@@ -38,6 +37,7 @@ from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
+from pipelines.session.storage import damaged
 
 _3D_FIX = 3
 _GPS = ("vehicle_gps_position", "sensor_gps")
@@ -78,8 +78,8 @@ class UlogFormat(DroneLog):
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position, attitude and gimbal.
 
-        The position is the estimator's local one (`local`) if the estimator ever marks it valid, else its
-        global one, else that of GPS. A local position that is never valid is the last choice, with a note.
+        The position is the estimator's local one if it is ever valid, else its global one, else that of GPS.
+        A local position that is never valid is the last choice, with a note.
         """
         topics = read_topics(path, _WANTED)
         notes: list[str] = []

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_bytes, read_head
-from pipelines.formats.common.refusals import damaged, empty
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, Skeleton, get_skeleton, joint_called, skeleton_with
 from pipelines.session.records import Detections
+from pipelines.session.storage import damaged, empty
 
 # Tables of mice share a name or two with people, as nose and left_ear.
 LEAST_NAMED_JOINTS = 6
@@ -56,7 +56,7 @@ def json_files(folder: Path) -> list[Path]:
 
 
 def samples(path: Path) -> list[object]:
-    """Read enough of a JSON file, or of a few files across a folder, to recognise the format.
+    """Read the beginning of a JSON file, or of a few files across a folder, to recognise the format.
 
     Lists are cut after their first entry, at the top and one level below. Unreadable files are skipped.
     """
@@ -93,10 +93,7 @@ def first_entry(sample: object) -> dict[str, object]:
 
 
 def is_alphapose_entry(entry: dict[str, object]) -> bool:
-    """Return True if a result entry is AlphaPose's rather than COCO's, which has the same layout.
-
-    AlphaPose adds `box` and `idx` (not in old versions) and names pictures; COCO numbers them.
-    """
+    """Return True if a result entry is AlphaPose's rather than COCO's, which numbers pictures."""
     image = entry.get("image_id")
     names_picture = isinstance(image, str) and _SUFFIX.search(image) is not None
     return (
@@ -171,8 +168,8 @@ def _digits(name: str) -> list[str]:
 class KeypointFile:
     """Reader of the people of a keypoint file, or of a folder with one for each picture.
 
-    `is_known` recognises the content of a JSON file, whose lists are cut (`samples`), or the head of a table.
-    `gather` adds every person of `Gathering.path`; joint names and picture size too if the file states them.
+    `is_known` recognises the content of a JSON file (see `samples`), or the head of a table. `gather` adds
+    every person of `Gathering.path`.
     """
 
     name: str
@@ -221,10 +218,7 @@ class Gathering:
         return len(self._rows)
 
     def contents(self) -> Iterator[tuple[Path, object]]:
-        """Yield the content of the file, or of every JSON file of the folder, one at a time.
-
-        In a folder, files that cannot be read are skipped and counted.
-        """
+        """Yield the content of the file, or of every readable JSON file of the folder; count the others."""
         if not self.path.is_dir():
             yield self.path, load_json(self.path)
             return
@@ -259,10 +253,7 @@ class Gathering:
         return frame
 
     def frame_of_file(self, file: Path, stem: str | None = None) -> int | None:
-        """Return the frame of a file of one picture: 0 for a file alone without a number in its name.
-
-        A file of a folder without a number is counted, and has none.
-        """
+        """Return the frame of a file of one picture: 0 for a file alone without a number, else None."""
         stem = file.stem if stem is None else stem
         if frame_number(stem, self.digits) is not None:
             return self.frame_of(stem, str(file))
@@ -276,8 +267,7 @@ class Gathering:
     ) -> None:
         """Add a person of a frame with its rows [K, 3] of x, y, confidence.
 
-        `rank` is the position within the frame, if the file groups people by frame; `own_id` that of a
-        tracker.
+        `rank` is the position within the frame, `own_id` the number that a tracker gave.
         """
         if self._rows and len(rows) != len(self._rows[0]):
             problem = f"holds {len(rows)} keypoints where the people before hold {len(self._rows[0])}"
@@ -342,11 +332,10 @@ class Gathering:
     def detections(self, skeleton: Skeleton, first_frame: int) -> Detections:
         """Return everything collected, cleaned and sorted.
 
-        Frames before `first_frame` and repeated detections (equal number by number) are dropped. A joint is
-        missing (NaN, confidence 0) if its position is not finite or beyond `_FARTHEST_PX`, or if its
-        confidence is 0: detectors write this for "not found", with any position. A confidence that is not
-        finite or below 0 becomes 0. All of this except "not found" is counted in `dropped`. A confidence
-        above 1 becomes 1, counted in `adjusted`.
+        Frames before `first_frame` and repeated detections are dropped. A joint is missing (NaN, confidence
+        0) if its position is not finite or beyond `_FARTHEST_PX`, or if its confidence is 0, which detectors
+        write for "not found". A confidence that is not finite or below 0 becomes 0, one above 1 becomes 1.
+        All but "not found" is counted in `dropped` and `adjusted`.
         """
         frame = np.array(self._frame, dtype=np.int64) - first_frame
         listed = np.array(sorted(self._listed), dtype=np.int64) - first_frame

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
     KeypointFile,
@@ -28,7 +27,7 @@ from pipelines.formats.keypoint_files.keypoint_people import (
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS
-from pipelines.session.storage import read_text
+from pipelines.session.storage import damaged, read_text
 
 # --- OpenPose ------------------------------------------------------------------------------------------
 

@@ -1,12 +1,9 @@
 """Maps in logs: Octomap, OccupancyGrid and PointCloud2.
 
-Consecutive octomaps and floor plans of a topic replace each other, as they did in flight.
-So every change is a map of its own, with the stamp from which it is valid. A log of any length needs the
-memory of its largest map only; its messages are read twice if there is more than one map.
-
-Point clouds become maps that grow: a voxel is occupied from the time of its first point on, and each map
-holds all points up to one of a few times of the flight. Moving things, above all the actor, leave a trace of
-occupied voxels.
+Consecutive octomaps and floor plans of a topic replace each other: every change is a map of its own, with the
+stamp from which it is valid. Point clouds become maps that grow: each holds all points up to one of a few
+times of the flight. Moving things, above all the actor, leave a trace of occupied voxels. Only the largest
+map is in memory.
 """
 
 from collections import Counter
@@ -18,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.logs.message_decoders import OCTOMAP
 from pipelines.formats.logs.messages import FAULTS, Stamps, bytes_of, nanoseconds
 from pipelines.formats.maps.octomap import leaves_of, occupancy_from
@@ -28,6 +24,7 @@ from pipelines.geometry.poses import compose, interpolate_poses, transform
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MOST_VOXELS, check_resolution
 from pipelines.session.records import Message, Occupancy, Trajectory
+from pipelines.session.storage import damaged
 
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -102,11 +99,7 @@ def frame_of(message: Message, source: str) -> str:
 
 
 class Losses:
-    """Messages of a topic that could not be used.
-
-    Attributes:
-        counts: number of messages by cause.
-    """
+    """Messages of a topic that could not be used, counted by cause."""
 
     def __init__(self, source: str, counts: Mapping[str, int] | None = None) -> None:
         self.counts: Counter[str] = Counter(counts)

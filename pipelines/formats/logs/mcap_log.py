@@ -1,7 +1,6 @@
 """MCAP files (mcap.dev/spec), whole or cut off, chunked or not, with any profile.
 
-The mcap library parses the records. But its readers stop at the first damage, and the one for files
-without an index ignores checksums and size limits. So this module walks the file itself.
+The mcap library parses the records. Its readers stop at the first damage, so this module walks the file.
 """
 
 from __future__ import annotations

@@ -53,10 +53,9 @@ def ros2_name(name: str) -> str:
 def decoder(schema: Schema) -> Decoder:
     """Make the function that decodes messages of a schema; it raises ValueError for bytes that do not fit.
 
-    ros1 and cdr: dataclasses of rosbags, numeric arrays as views into the message. Without a definition
-    in the file, the types of ROS 1 Noetic or of the newest ROS 2 that rosbags knows are used. Messages of
-    a ROS 2 bag in compression mode `message` are decompressed. json: namespaces. protobuf: messages
-    of the protobuf library.
+    ros1 and cdr: dataclasses of rosbags, numeric arrays as views into the message; without a definition in
+    the file, those of ROS 1 Noetic or of the newest ROS 2. json: namespaces. protobuf: messages of that
+    library. Messages of a ROS 2 bag in compression mode `message` are decompressed.
     """
     found = _decoder_or_reason(schema)
     if isinstance(found, str):
@@ -222,12 +221,9 @@ class _Decompressor(Protocol):
 
 
 def inflate(data: memoryview | bytes, compression: str, size: int) -> tuple[memoryview | bytes, bool]:
-    """Decompress at most `size` bytes; also return True if that was all, neither cut off nor longer.
+    """Decompress at most `size` bytes of a frame that is perhaps cut off; also return True if that was all.
 
-    Args:
-        data: one compressed frame, perhaps cut off.
-        compression: none (or empty), bz2, lz4 or zstd.
-        size: largest length of the result.
+    `compression` is none (or empty), bz2, lz4 or zstd.
     """
     if compression in {"", "none"}:
         return data[:size], len(data) <= size

@@ -1,8 +1,7 @@
 """Conversion of decoded log messages to samples: poses, transforms, gimbal angles, intrinsics and pictures.
 
-Messages of ROS 1 and ROS 2 and Foxglove's schemas (in protobuf, JSON or ROS) have the same content under
-slightly different names. This module alone handles the differences. A sample whose `stamp_ns` is 0
-comes from a message without a header stamp: it has only the time of its receipt.
+Messages of ROS 1 and ROS 2 and Foxglove's schemas have the same content under slightly different names, which
+this module alone handles. A sample with `stamp_ns` 0 has only the time of its receipt.
 """
 
 import base64
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.formats.common.refusals import damaged
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.clocks import ClockStep, find_steps, fit_clock, without_steps
 from pipelines.session.errors import DataError
@@ -30,6 +28,7 @@ from pipelines.session.records import (
     Sample,
     Topic,
 )
+from pipelines.session.storage import damaged
 
 Kind = Literal["poses", "transforms", "angles", "intrinsics", "pictures"]
 Stamps = Literal["header", "receive"]
@@ -52,9 +51,8 @@ _SIGNATURES = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png"}
 def kind_of(topic: Topic) -> Kind | None:
     """Return the kind of a topic's messages by the name of their type; None for types that are not read.
 
-    "poses" are those of one body, "transforms" those of any number of frames. Arrays of poses at one
-    moment (PoseArray, foxglove.PosesInFrame) are left out, because they do not name the body of each pose.
-    Maps are left out too, because they are no samples: see `maps`.
+    "poses" are those of one body, "transforms" those of any number of frames. Arrays of poses at one moment
+    do not name the body of each and are left out, and so are maps (see `maps`).
     """
     known = _READERS.get(topic.type)
     return known[0] if known else None
@@ -63,12 +61,9 @@ def kind_of(topic: Topic) -> Kind | None:
 def samples(message: Message, source: Source) -> Iterator[Sample]:
     """Convert one message to samples.
 
-    A nav_msgs/Path gives every pose at its own stamp, in the message's order. The receive stamp belongs to
-    its last pose. Each earlier pose gets an earlier receive stamp, by the difference of its own stamp to the
-    last one's.
-
-    A CameraInfo's K is of the full sensor; region of interest and binning are applied, so that the
-    intrinsics are those of the pictures beside it.
+    A nav_msgs/Path gives every pose at its own stamp. The receive stamp belongs to its last pose; earlier
+    ones are earlier by the difference of the stamps. A CameraInfo's K is of the full sensor; region of
+    interest and binning are applied, so that the intrinsics are those of the pictures beside it.
     """
     known = _READERS.get(message.topic.type)
     if known is None:
@@ -83,9 +78,8 @@ def samples(message: Message, source: Source) -> Iterator[Sample]:
 def all_samples(messages: Iterable[Message], source: Source) -> Iterator[Sample]:
     """Convert many messages to samples, in order; see `samples`.
 
-    A nav_msgs/Path repeats earlier paths and adds to them. Of each path only the poses later than all
-    before on its topic are given: the poses as they were first published, as an odometry topic would have
-    them. If a later path moves earlier poses (loop closure), the new positions are ignored.
+    A nav_msgs/Path repeats earlier paths and adds to them. Of each only the poses later than all before on
+    its topic are given: as they were first published, whatever a loop closure moves later.
     """
     newest: dict[str, int] = {}
     for message in messages:
@@ -137,11 +131,8 @@ def _pose(message: Message, _: Source) -> Iterator[Sample]:
 def _path(message: Message, source: Source) -> Iterator[Sample]:
     stamps = [nanoseconds(pose.header.stamp) for pose in message.value.poses]
     if 0 in stamps:
-        raise DataError(
-            source,
-            f"topic {message.topic.name}: the poses of a path have no stamps of their own",
-            "name a topic of Odometry or PoseStamped instead",
-        )
+        problem = f"topic {message.topic.name}: the poses of a path have no stamps of their own"
+        raise DataError(source, problem, "name a topic of Odometry or PoseStamped instead")
     for pose, stamp_ns in zip(message.value.poses, stamps, strict=True):
         receive_ns = _checked(message.receive_ns + stamp_ns - stamps[-1])
         yield from _pose(replace(message, receive_ns=receive_ns, value=pose), source)

@@ -1,8 +1,4 @@
-"""Pictures in logs: the times at which they were taken or triggered, and their pixels.
-
-Names and layouts of raw pixels are those of ROS' sensor_msgs/image_encodings.hpp, which Foxglove's RawImage
-also uses.
-"""
+"""Pictures in logs: their times, and their pixels, as ROS' sensor_msgs/image_encodings.hpp names them."""
 
 from array import array
 from collections.abc import Iterator
@@ -100,13 +96,7 @@ def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamp
 
 
 def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
-    """Return the stamps of the `later_pictures`, [n], strictly increasing.
-
-    Args:
-        header_ns: [N] stamps of the headers of all pictures, in the order of receipt; 0 without one.
-        receive_ns: [N] of receipt.
-        stamps: which of them order the pictures: header or receive.
-    """
+    """Return the stamps of the `later_pictures`, [n], strictly increasing, by header (0: none) or receipt."""
     pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
     return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
 

@@ -37,8 +37,7 @@ _TURNED = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped")
 def axes_of_topic(topic: str | None, parent: str | None) -> Axes | None:
     """Return the axes that a known program gives its poses, by the name of the topic or of their frame.
 
-    AirSim's node for ROS publishes /airsim_node/VEHICLE/odom_local_ned and frames below world_ned: NED and
-    FRD (microsoft.github.io/AirSim/airsim_ros_pkgs).
+    AirSim's node: /airsim_node/VEHICLE/odom_local_ned and frames below world_ned are NED and FRD.
     """
     return "ned" if _AIRSIM.search(topic or "") or (parent or "").strip("/") == "world_ned" else None
 

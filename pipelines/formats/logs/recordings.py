@@ -1,9 +1,8 @@
 """Recordings: files that each list their messages; topics, order of receipt over all files, and losses.
 
-A part (one file) knows the position of every message before any is read. So messages come in order and
-filtered without being kept in memory, and every loss has a cause and a count. ROS 1 bags and MCAP are files
-of chunks: they are walked from record to record, without their summary, so the same code reads a whole file
-and one that ends early. Only chunks without an index are decompressed to find their messages.
+A part (one file) knows the position of every message before any is read. So messages come in order without
+being kept in memory, and every loss has a cause and a count. ROS 1 bags and MCAP are files of chunks: they
+are walked from record to record, without their summary, so the same code reads a file that ends early.
 """
 
 from __future__ import annotations
@@ -21,13 +20,12 @@ from typing import IO
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.logs.message_decoders import Schema, decoder, inflate
 from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.recognition import describe_lfs_pointer
 from pipelines.session.records import Message, Topic
-from pipelines.session.storage import as_data_error, refuse_special
+from pipelines.session.storage import as_data_error, damaged, refuse_special
 
 # Causes of losses, as sessions and `mocap info` state them.
 UNDEFINED = "messages without a usable definition"
@@ -116,11 +114,7 @@ class LogPart(ABC):
         """Yield the bytes of messages, by rows of the table; pass unreadable rows to `lose`."""
 
     def take(self, table: MessageTable) -> None:
-        """Keep the table of found messages, without those of undefined channels, which are counted.
-
-        Raises:
-            DataError: the file defines too many types, or is damaged and holds no message.
-        """
+        """Keep the table of found messages, without those of undefined channels, which are counted."""
         types = len({channel.schema for channel in self.channels.values()})
         if types > _MOST_TYPES:
             raise damaged(self.path, f"defines {types} types of messages")
@@ -398,10 +392,7 @@ class OpenLog:
     def messages(
         self, topics: Collection[str], *, first_ns: int = -(2**63), last_ns: int = 2**63 - 1
     ) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of receipt; others are neither read nor decoded.
-
-        Messages that were received before `first_ns` or after `last_ns` are left out.
-        """
+        """Yield the messages of some topics received from `first_ns` to `last_ns`, in that order."""
         streams = [self._of_part(part, frozenset(topics), first_ns, last_ns) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 

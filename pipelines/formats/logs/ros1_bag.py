@@ -1,8 +1,4 @@
-"""ROS 1 bags, version 2.0 (wiki.ros.org/Bags/Format/2.0), whole or cut off.
-
-rosbags decodes the messages. But its reader refuses bags without an index and bags that end early.
-So this module walks the records itself.
-"""
+"""ROS 1 bags, version 2.0 (wiki.ros.org/Bags/Format/2.0), whole or cut off; rosbags decodes the messages."""
 
 import re
 import struct

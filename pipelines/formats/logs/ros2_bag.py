@@ -1,9 +1,7 @@
 """Reader of ROS 2 bags: folders of sqlite3 or MCAP files with or without metadata.yaml, and sqlite3 files.
 
-rosbags decodes the messages. But its reader needs a correct metadata.yaml and files that can be
-read to their end. So this module reads the files itself. From a damaged or shortened database, all rows on
-readable pages are read. rosbags reads databases with APSW too: its SQLite reads a long message from the disk
-without keeping the pages in memory.
+rosbags decodes the messages; its reader needs a correct metadata.yaml and whole files. From a damaged
+database, all rows on readable pages are read. APSW reads a long message without keeping its pages in memory.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from typing import Any
 import apsw
 import numpy as np
 
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.logs.mcap_log import McapPart
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import (
@@ -42,7 +39,7 @@ from pipelines.formats.logs.recordings import (
 from pipelines.formats.logs.trajectories import open_recording
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error
+from pipelines.session.storage import as_data_error, damaged
 from pipelines.session.yaml_files import plain_yaml
 
 # Causes of losses.
@@ -263,12 +260,8 @@ class Sqlite3Part(LogPart):
             self.require_content()
         except _UNREADABLE as error:
             self.close()
-            raise DataError(
-                path,
-                f"cannot be read by sqlite3 ({error})",
-                "try `sqlite3 FILE .recover`, or copy it again",
-                code="damaged",
-            ) from None
+            remedy = "try `sqlite3 FILE .recover`, or copy it again"
+            raise DataError(path, f"cannot be read by sqlite3 ({error})", remedy, code="damaged") from None
         except BaseException:
             self.close()
             raise

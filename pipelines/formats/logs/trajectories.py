@@ -1,7 +1,6 @@
 """Conversion of a log's messages to trajectories: of poses, of a chain of transforms, of a gimbal.
 
-Numbers are gathered into flat arrays (72 bytes a pose, 288 more with a covariance), so a log of any length
-streams through.
+Numbers are gathered into flat arrays, so a log of any length streams through.
 """
 
 from array import array
@@ -119,11 +118,8 @@ class _Samples:
 def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gathered:
     """Read the trajectory of one body, in the axes of the log; covariances in ours (rotation in the body).
 
-    Rows are cleaned by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown and
-    left out.
-
-    Args:
-        stamps: which stamp is the time of a pose. A pose without a header stamp (0) takes that of receipt.
+    Rows are cleaned by `clean_poses`. A pose without a header stamp (0) takes that of receipt. A covariance
+    that is zero throughout is unknown and left out.
     """
     place = f"{source} {topic}"
     rows = logged_poses(all_samples(recording.messages([topic]), source), place)
@@ -139,11 +135,8 @@ def logged_poses(samples: Iterable[Sample], source: Source) -> LoggedRows:
             raise DataError(source, "holds no poses", "name a topic of poses", code="no-poses")
         edge = (sample.target, sample.source)
         if frames is not None and edge != frames:
-            raise DataError(
-                source,
-                f"holds poses of several frames ({_named(frames)}, {_named(edge)})",
-                "say which with `parent` and `child`",
-            )
+            problem = f"holds poses of several frames ({_named(frames)}, {_named(edge)})"
+            raise DataError(source, problem, "say which with `parent` and `child`")
         frames = edge
         gathered.add_pose(sample)
     return replace(gathered.rows(7), frames=frames or ("", ""))
@@ -159,11 +152,7 @@ def attitudes_of(
 ) -> Gathered:
     """Build a gimbal's attitude over time, in the axes of the log, about its own pivot (positions are 0).
 
-    Args:
-        samples: angles or quaternions in the order of receipt.
-        stamps: as in `poses_of`.
-        order: order of the angles in the log (`attitude_from_angles`); ignored for quaternions.
-        units: of the angles.
+    `order` and `units` are those of angles (`attitude_from_angles`), ignored for quaternions.
     """
     gathered, of_angles = _Samples(), False
     for sample in samples:
@@ -220,16 +209,9 @@ def chained(
     """Compute the pose of one frame in another over time, through the log's tree of transforms.
 
     The stamps are those of the transform with the highest rate on the route. A transform is static if it was
-    given as such, or is logged only once, as in Foxglove's logs. Of several values of a static transform,
-    each holds from its publication on, and the first before it, too. Losses are counted by cause and
-    transform.
-    Stamps at which another transform on the route is unknown are counted under "no transform".
-
-    Args:
-        parent: the frame in which the poses are wanted; a leading slash is ignored.
-        child: the frame whose poses are wanted.
-        stamps: as in `poses_of`.
-        max_gap_ns: a moving transform is unknown between stamps further apart than this.
+    given as such, or is logged only once, as in Foxglove's logs; of several values each holds from its
+    publication on. A moving one is unknown between stamps further apart than `max_gap_ns`. Losses are counted
+    by cause and transform; stamps at which another transform on the route is unknown under "no transform".
     """
     parent, child = parent.lstrip("/"), child.lstrip("/")
     every = {**transforms.static, **transforms.moving}
@@ -260,11 +242,8 @@ def chained(
     found = chain(links, parent, child, max_gap_ns=max_gap_ns)
     known = ~np.isnan(found.position[:, 0])
     if not known.any():
-        raise DataError(
-            source,
-            f"never states all the transforms from {parent!r} to {child!r} at one time",
-            "raise --max-pose-gap, or choose other frames",
-        )
+        problem = f"never states all the transforms from {parent!r} to {child!r} at one time"
+        raise DataError(source, problem, "raise --max-pose-gap, or choose other frames")
     if not known.all():
         dropped["no transform"] = int(np.count_nonzero(~known))
     trajectory = Trajectory(
@@ -296,9 +275,8 @@ def _published_values(logged: Sequence[LoggedRows]) -> LoggedRows:
 def frames_of_poses(recording: Log, source: str, taken: Iterable[tuple[str | None, str | None]]) -> list[str]:
     """Return the frames of a log's poses, each once, without the leading slash of ROS 1.
 
-    Args:
-        taken: topic and parent of each; a parent names the frame itself, and a missing topic means the
-            only one. Entries that do not fit the log are ignored; reading the poses reports them.
+    `taken` are topic and parent of each; a parent names the frame itself, and a missing topic means the only
+    one. Entries that do not fit the log are ignored; reading the poses reports them.
     """
     topics = [topic.name for topic in recording.topics if kind_of(topic) == "poses"]
     frames: list[str] = []
@@ -327,17 +305,9 @@ def place_of_frame(
 ) -> Trajectory:
     """Return the pose of a frame in the log's world; one row if it is that world or never moves in it.
 
-    The log's world is the stated frame, else the frame of the poses that are taken from this log, else
-    one with the name of a fixed frame. If a map lies in such a fixed frame and no transforms connect it with
-    the frame of the poses, both are taken for one frame, and a note says so.
-
-    Args:
-        frame: the frame to find; an empty name means the world.
-        parent: the world's frame, if it is stated.
-        poses_in: the frames of the poses.
-        stamps: which stamps of the transforms are used.
-        max_gap_ns: the longest gap between two transforms that is interpolated.
-        note: receives the result in words.
+    The log's world is the stated frame `parent`, else the frame of the poses that are taken from this log,
+    else one with the name of a fixed frame. If the frame (empty: the world) is such a fixed frame and no
+    transforms connect it with that of the poses, both are taken for one, and `note` receives that.
     """
     known = [parent.lstrip("/")] if parent is not None else [*poses_in] or list(_FIXED_FRAMES)
     if not frame or frame in known:
@@ -397,9 +367,9 @@ _NOTED_GAP_S = 0.1
 def open_recording(paths: Sequence[Path], open_part: Callable[[Path], LogPart]) -> OpenLog:
     """Open the files of a log, without steps of the recorder's clock, which `notes` of the log describe.
 
-    The recorder's computer sets its clock: all stamps of receipt step, and with them those of the headers
-    that the same clock makes (`find_steps` then finds these). Stamps that go back in the order of writing
-    show it. A gap shows it if bodies moved on as if no time had passed.
+    All stamps of receipt step with the clock, and with them those of the headers that the same clock makes.
+    Stamps that go back in the order of writing show it. A gap shows it if bodies moved on as if no time had
+    passed.
     """
     log = OpenLog(*open_parts(paths, open_part))
     for part in log.parts:
@@ -489,21 +459,17 @@ PATH = "nav_msgs/msg/Path"
 
 
 def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Trajectory:
-    """Read the positions that a topic of `PATH` commanded, in the axes of the log.
+    """Read the positions that a topic of `PATH` commanded, in the axes of the log; rotations have no meaning.
 
-    By the stamps of receipt, a plan begins at the time of its receipt. Empty plans are counted. The rotation
-    is the identity and has no meaning.
+    By the stamps of receipt, a plan begins at the time of its receipt. Empty plans are counted.
     """
     t_ns, position, empty = array("q"), array("d"), 0
     for message in recording.messages([topic]):
         points = [point for point in samples(message, source) if isinstance(point, PoseSample)]
         empty += not points
         if any(later.stamp_ns <= earlier.stamp_ns for earlier, later in pairwise(points)):
-            raise DataError(
-                source,
-                f"topic {topic}: the points of a plan have no times of their own",
-                "name a topic of setpoints instead",
-            )
+            problem = f"topic {topic}: the points of a plan have no times of their own"
+            raise DataError(source, problem, "name a topic of setpoints instead")
         for number, point in enumerate(points):
             late_ns = message.receive_ns - points[0].stamp_ns if stamps == "receive" else 0
             if not number:  # a later plan replaces all earlier points from its first time on

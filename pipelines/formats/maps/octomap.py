@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import first_bytes, read_bytes, split_header
-from pipelines.formats.common.refusals import bad_value, damaged
 from pipelines.formats.maps.voxel_grids import MapFile
 from pipelines.geometry.arrays import Bytes, Float32, Int32, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size
 from pipelines.session.records import Occupancy
+from pipelines.session.storage import bad_value, damaged
 
 # OctoMap's trees always have this many levels.
 DEPTH = 16
@@ -92,12 +92,10 @@ class OctomapFormat(MapFile):
 def occupancy_from(
     source: Path | str, leaves: Leaves, finest_m: float, resolution_m: float | None
 ) -> Occupancy:
-    """Build the dense grid of a tree's box.
+    """Build the dense grid of a tree's box; there must be a leaf.
 
-    Args:
-        leaves: at least one.
-        finest_m: the side of the tree's finest voxel.
-        resolution_m: the side of the grid's voxels, `finest_m` times a power of two; None for the finest.
+    `finest_m` is the side of the tree's finest voxel, `resolution_m` that times a power of two; None for the
+    finest.
     """
     from pipelines.formats.maps.octree import fill
 
@@ -117,17 +115,13 @@ def occupancy_from(
 def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str) -> Leaves:
     """Find the leaves of a tree without a header, as in octomap_msgs/Octomap.
 
-    `payload` are the bytes that follow the header in a file, in the layout of a .bt (`is_binary`, one for all
-    kinds of trees) or a .ot.
+    `payload` are the bytes behind the header of a .bt (`is_binary`, one for all kinds of trees) or a .ot.
     """
     if is_binary:
         return binary_leaves(source, payload)
     if tree not in _RECORD_BYTES:
-        raise DataError(
-            source,
-            f"is a {tree[:40]}, whose nodes are not known",
-            f"save it as {' or '.join(_RECORD_BYTES)}, or as .bt",
-        )
+        problem = f"is a {tree[:40]}, whose nodes are not known"
+        raise DataError(source, problem, f"save it as {' or '.join(_RECORD_BYTES)}, or as .bt")
     return full_leaves(source, payload, _RECORD_BYTES[tree])
 
 
@@ -226,11 +220,9 @@ def _halvings(source: Path | str, finest_m: float, resolution_m: float | None) -
         return 0
     halvings = round(math.log2(check_resolution(source, resolution_m) / finest_m))
     if not 0 <= halvings <= DEPTH or not math.isclose(finest_m * 2**halvings, resolution_m, rel_tol=1e-6):
-        raise DataError(
-            source,
-            f"its voxels of {finest_m:g} m cannot be merged to {resolution_m:g} m",
-            f"state resolution_m: {finest_m:g}, {2 * finest_m:g}, {4 * finest_m:g}, ...",
-        )
+        problem = f"its voxels of {finest_m:g} m cannot be merged to {resolution_m:g} m"
+        remedy = f"state resolution_m: {finest_m:g}, {2 * finest_m:g}, {4 * finest_m:g}, ..."
+        raise DataError(source, problem, remedy)
     return halvings
 
 

@@ -27,8 +27,8 @@ def walk_binary(
 ) -> int:
     """Write the leaves of a .bt tree, one word per inner node, depth first.
 
-    `key` [L, 3], `depth` [L] and `log_odds` [L] have room for exactly the leaves in all words.
-    Returns the number of words that the tree has, or `BREAKS_OFF` or `TOO_DEEP`.
+    `key` [L, 3], `depth` and `log_odds` receive them. Return the number of words that the tree has, or
+    `BREAKS_OFF` or `TOO_DEEP`.
     """
     stack = np.empty((_STACK, 4), dtype=np.int64)
     stack[0] = 0
@@ -68,10 +68,10 @@ def walk_binary(
 
 @cached
 def walk_full(children: Bytes, node: Int32, key: Int32, depth: Bytes) -> int:
-    """Find the leaves of a .ot tree: the record and the position of each.
+    """Find the leaves of a .ot tree: the record and the position of each; returns like `walk_binary`.
 
-    `children` [N] are the bit masks of the records, depth first; `node`, `key` [L, 3] and `depth` have
-    room for exactly the records without children. Returns like `walk_binary`.
+    `children` [N] are the bit masks of the records; `node`, `key` [L, 3] and `depth` hold those without
+    children.
     """
     stack = np.empty((_STACK, 4), dtype=np.int64)
     stack[0] = 0
@@ -124,16 +124,11 @@ def fill(grid: Float32, key: Int32, depth: Bytes, probability: Float32, low: Int
 
 @cached
 def decompress(packed: Bytes, target: Bytes) -> int:
-    """Fill `target` from an LZF stream.
+    """Fill `target` from an LZF stream; return the bytes written, or -1 if it is damaged.
 
-    The stream (liblzf by Marc Lehmann, lzf_d.c) is a sequence of instructions, each with a byte c first:
-
-    - c < 32: copy the c + 1 bytes that follow;
-    - else: repeat (c >> 5) + 2 bytes of the output (if c >> 5 is 7, a byte to add to the length follows) from
-      ((c & 31) << 8) + next byte + 1 bytes back; the two may overlap.
-
-    Returns:
-        The bytes written, or -1 if the stream is cut off, too long or points outside.
+    The stream (liblzf by Marc Lehmann, lzf_d.c) is a sequence of instructions, each with a byte c first. c <
+    32: copy the c + 1 bytes that follow. Else repeat (c >> 5) + 2 bytes of the output (if c >> 5 is 7, a byte
+    to add to the length follows) from ((c & 31) << 8) + next byte + 1 bytes back; the two may overlap.
     """
     read, written = 0, 0
     while read < len(packed):

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.files import first_bytes, read_bytes, split_header
-from pipelines.formats.common.refusals import damaged, empty
 from pipelines.formats.maps.voxel_grids import MapFile, VoxelSet
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import install_command, need
+from pipelines.session.storage import damaged, empty
 
 _SIZES = struct.Struct("<II")
 MOST_EXPANSION = 88

@@ -3,9 +3,8 @@
 The rules are nav2_map_server's (map_io.cpp). The picture's last row is the lowest y. `origin` is x, y, yaw of
 the lower left corner. Darkness is 1 - shade, with `negate` the shade itself. Modes: trinary - above
 `occupied_thresh` occupied, below `free_thresh` free, between them unknown; scale - between them in
-proportion, transparent pixels unknown; raw - values 0 to 100 are percent, others unknown.
-
-A plan has no heights: it is extruded from z = 0 to `HEIGHT_M`.
+proportion, transparent pixels unknown; raw - values 0 to 100 are percent, others unknown. A plan is extruded
+from z = 0 to `HEIGHT_M`.
 """
 
 from __future__ import annotations
@@ -22,13 +21,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.common.files import leads_out, numbers, read_head, read_yaml
-from pipelines.formats.common.refusals import bad_value, damaged
 from pipelines.formats.maps.voxel_grids import MapFile, extruded
 from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution
 from pipelines.session.records import Occupancy
-from pipelines.session.storage import refuse_special
+from pipelines.session.storage import bad_value, damaged, refuse_special
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -59,8 +57,7 @@ class _FloorPlan:
 class RosMap(MapFile):
     """Reader into voxels of the plan's own resolution, or of a stated one.
 
-    A plan that is turned (yaw), or read at another resolution, is sampled so densely that every pixel is
-    met. A voxel takes the largest probability met in it: a wall may grow by a voxel, but never vanishes.
+    A voxel takes the largest probability met in it: a wall may grow by a voxel, but never vanishes.
     """
 
     name = "ros_map"
@@ -139,12 +136,8 @@ def _find_image(path: Path, image: str) -> Path:
     try:
         return next(candidate for candidate in candidates if candidate.is_file())
     except (StopIteration, OSError, ValueError):  # OSError, ValueError: too long or invalid a name
-        raise DataError(
-            path,
-            f"its picture {image[:200]} is not there",
-            "put it beside the YAML file",
-            code="no-such-file",
-        ) from None
+        problem = f"its picture {image[:200]} is not there"
+        raise DataError(path, problem, "put it beside the YAML file", code="no-such-file") from None
 
 
 def _probabilities(path: Path, plan: _FloorPlan) -> Float32:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.refusals import empty
 from pipelines.geometry.arrays import Float, Float32, Int64
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
@@ -22,6 +21,7 @@ from pipelines.session.maps import (
     read_grid,
 )
 from pipelines.session.records import Occupancy
+from pipelines.session.storage import empty
 
 # Drones keep a greater distance, and a site of 200 m fits the memory.
 DEFAULT_RESOLUTION_M = 0.2
@@ -72,11 +72,7 @@ class VoxelSet:
         return len(self._keys)
 
     def add(self, points: Float, t_ns: int = 0) -> None:
-        """Add the points [N, 3] of one time; those that are not finite or too far are counted.
-
-        Raises:
-            MapSizeError: their box has too many voxels.
-        """
+        """Add the points [N, 3] of one time, count bad ones; MapSizeError if there are too many voxels."""
         usable = np.isfinite(points).all(axis=1)
         with np.errstate(over="ignore", invalid="ignore"):
             place = np.floor(points / self._side)
@@ -115,11 +111,7 @@ class VoxelSet:
         return np.unique(self._since_ns)
 
     def occupancy(self, at_ns: int = 0) -> Occupancy:
-        """Return the map of all points up to a time, in the box of all voxels; it is valid from that time.
-
-        Raises:
-            DataError: there is no point.
-        """
+        """Return the map of all points up to a time, valid from then; DataError if there is none."""
         if self._first is None:
             raise empty(self._source, "holds no point that is finite")
         keys = self._keys[self._since_ns <= at_ns]
@@ -136,11 +128,10 @@ def placed(
 ) -> Occupancy:
     """Convert a voxel grid in its own frame to the world's axes.
 
-    Turned by a multiple of a right angle it keeps its voxels: they are only counted along other axes. For any
-    other turn about the vertical it is sampled so densely that every voxel is met. A voxel takes the largest
-    probability met in it: a wall may grow by a voxel, but never vanishes. A turn is rounded to the nearest of
-    these if no voxel moves by more than half its side, because counting in voxels rounds by as much anyway.
-    `resolution_m` is another side for the voxels, for a grid of one layer.
+    Turned by a multiple of a right angle it keeps its voxels; any turn is rounded to one if no voxel moves by
+    more than half its side. For any other turn about the vertical it is sampled so densely that every voxel
+    is met, and a voxel takes the largest probability met in it. `resolution_m` is another side, for a grid of
+    one layer.
     """
     position, quaternion = world_from_grid
     rotation = matrix_from_quaternion(quaternion)
@@ -168,13 +159,9 @@ def extruded(
     side_m: float,
     height_m: float,
 ) -> Occupancy:
-    """Convert a floor plan to the world's axes, extruded upwards from its own plane.
+    """Convert a floor plan [X, Y] of probabilities, with the pose of its origin, to voxels extruded upwards.
 
-    Args:
-        plan: probabilities [X, Y], the corner of the first at the plan's origin.
-        world_from_plan: the pose of its origin.
-        side_m: of the voxels.
-        height_m: height of the cells, rounded up to whole voxels.
+    `height_m` is rounded up to whole voxels of `side_m`.
     """
     position, quaternion = world_from_plan
     rotation = matrix_from_quaternion(quaternion)
@@ -243,19 +230,12 @@ def _turned(source: str, grid: Occupancy, world_from_plane: Float, side: float) 
 def sampled(
     grid: Occupancy, world_from_plane: Float, low: Float, shape: tuple[int, int], side: float
 ) -> Float32:
-    """Sample a grid that is turned about the vertical so densely that every voxel is met.
+    """Sample a grid that is turned about the vertical so densely that every voxel is met; [X, Y, Z].
 
-    Samples form a square lattice of pitch p with the covering radius p / sqrt(2). The disc within a
-    voxel has half its side as radius. So every voxel is met if p is at most 1 / sqrt(2) of a voxel.
-
-    Args:
-        world_from_plane: rotation [2, 2] about the vertical axis through the origin of that frame.
-        low: [2] the lowest corner of the result, in the world's axes from that origin.
-        shape: voxels of the result along x and y.
-        side: of those voxels, m.
-
-    Returns:
-        [X, Y, Z] the largest probability met in each voxel; NaN if none.
+    Samples form a square lattice of pitch p with the covering radius p / sqrt(2), so p is at most 1 / sqrt(2)
+    of a voxel. `world_from_plane` [2, 2] turns about the origin of that frame, `low` [2] is the lowest corner
+    of the result from there in the world's axes, `shape` and `side` are its voxels along x and y. NaN where
+    nothing is met.
     """
     turned = np.full((*shape, grid.probability.shape[2]), np.nan, dtype=np.float32)
     dense = math.ceil(math.sqrt(2) * side / grid.resolution_m)
@@ -306,11 +286,8 @@ class GridNpz(MapFile):
         """Read the grid as it is."""
         occupancy = read_grid(path)
         if resolution_m is not None and not math.isclose(resolution_m, occupancy.resolution_m, rel_tol=1e-6):
-            raise DataError(
-                path,
-                f"its voxels are {occupancy.resolution_m:g} m, not {resolution_m:g} m",
-                "leave resolution_m out, or store the grid at that resolution",
-            )
+            problem = f"its voxels are {occupancy.resolution_m:g} m, not {resolution_m:g} m"
+            raise DataError(path, problem, "leave resolution_m out, or store the grid at that resolution")
         return occupancy
 
 

@@ -1,16 +1,12 @@
 """Exports to glTF 2.0, for Blender and viewers of the web: the moving skeleton and the cameras; bodies.
 
-Every joint is an octahedron and every bone a bar, both moved by animation; a missing one has the size zero. A
-camera is a glTF camera that follows its poses. Metres; glTF's axes are x right, y up and z towards the
-viewer: the (x, y, z) of the file are the world's (x, z, -y). Second 0 is `zero_ns` of the asset's extras, the
-skeleton's first time. At most 30 moments a second are written. The same recording gives the same bytes.
+Every joint is an octahedron and every bone a bar, both moved by animation; a missing one has the size zero,
+and so has a missing body. The (x, y, z) of the file are the world's (x, z, -y). Second 0 is `zero_ns` of the
+asset's extras. At most 30 moments a second are written. The same recording gives the same bytes.
 
 The surface of a body rests as `geometry.body_model` has it. Each of its moving bones is a node in the world's
-axes, below one node that turns z up into y up. A vertex follows its four strongest bones. Where a person has
-no body the size is zero.
-
-Source: Khronos, glTF 2.0 Specification (2021): 3.6.2 accessors, 3.7.3 skins, 3.11 animations, 3.10 cameras,
-4 GLB.
+axes, below one node that turns z up into y up. A vertex follows its four strongest bones. Source: Khronos,
+glTF 2.0 Specification (2021): 3.6.2 accessors, 3.7.3 skins, 3.11 animations, 3.10 cameras, 4 GLB.
 """
 
 from __future__ import annotations

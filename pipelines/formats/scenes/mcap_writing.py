@@ -1,11 +1,8 @@
 """Export to mcap: one log of ROS 2 messages for Foxglove.
 
-RViz shows it, too, except for the videos: it has no display for CompressedVideo without a plugin.
-
 | topic | type | |
 | --- | --- | --- |
-| /skeleton | visualization_msgs/MarkerArray | bones and joints, at every time of the skeleton |
-| /uncertainty | visualization_msgs/MarkerArray | 95 % ellipsoids of the joints, at most 10 times a second |
+| /skeleton, /uncertainty | visualization_msgs/MarkerArray | bones and joints; 95 % ellipsoids at 10 Hz |
 | /angles, /angles/sigma | sensor_msgs/JointState | angles of the joints and their standard deviations, rad |
 | /sigma | sensor_msgs/JointState | standard deviations of the joints, per axis, m, in the field `position` |
 | /doubts | rcl_interfaces/Log | what contradicts itself in the flight, as warnings at the beginning |
@@ -15,9 +12,8 @@ RViz shows it, too, except for the videos: it has no display for CompressedVideo
 | /CAMERA/image/video | foxglove_msgs/CompressedVideo | H.264, at most 960 px wide |
 | /map | sensor_msgs/PointCloud2 | the middles of the map's surface voxels |
 
-World axes as in the session (z up), cameras with x right, y down, z forward; metres. Poses are the refined
-ones if there are any. A missing joint is not in its message. The same recording gives the same
-bytes; frames are written one after the other and are never all in memory.
+World axes as in the session, cameras with x right, y down, z forward. Poses are the refined ones if there are
+any. The same recording gives the same bytes; frames are never all in memory.
 """
 
 from __future__ import annotations

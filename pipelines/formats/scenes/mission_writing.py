@@ -1,15 +1,8 @@
 """Export to mission: the flights of a planner's arms as autopilots and ground stations take them.
 
-| file | for | what it holds |
-| --- | --- | --- |
-| `<name>_<arm>_<drone>.plan` | QGroundControl (MAVLink) | take-off, waypoints, return; camera pitch and yaw |
-| `<name>_<arm>_<drone>.kmz` | DJI Pilot 2 | the same as WPML 1.0.2, `template.kml` and `waylines.wpml` |
-| `<name>_<arm>_<drone>.csv` | PX4 offboard | setpoints at 10 Hz, with the columns of MAVSDK Drone Show |
-| `<name>_<arm>.mcap` | ROS 2 | `/<drone>/trajectory`, and `/origin`, where the world's zero lies |
-
-The home of a drone lies under its first place, as high as the ground under the actor at the start. Heights
-are relative to it, and so are north, east and down of the setpoints. The nose of the drone looks where the
-camera does. Waypoints and setpoints keep the times of the flight.
+The home of a drone lies under its first place, as high as the ground under the actor at the start. Heights,
+and north, east and down of setpoints, are relative to it. The nose of the drone looks where the camera does.
+Waypoints and setpoints keep the times of the flight. docs/outputs.md describes the files.
 """
 
 from __future__ import annotations

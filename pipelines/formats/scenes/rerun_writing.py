@@ -1,18 +1,9 @@
 """Export to Rerun: a recording for its viewer. Needs rerun-sdk.
 
-    world                             z up, metres
-    world/map                         surface voxels of the map
-    world/<person>/skeleton            joints with their bones, at every time of the skeleton
-    world/<person>/uncertainty         95 % ellipsoids
-    world/cameras/<camera>            its pose (the refined one if there is one), over time
-    world/cameras/<camera>/image      pinhole, and pictures with the skeleton drawn into them (H.264, 960 px)
-    world/paths/<camera>              its path
-    angles/<person>/<angle>            series in degrees; in `<angle>/sigma` its standard deviation
-    doubts                            what contradicts itself in the flight, as warnings at the beginning
-    sigma/<person>/<joint>             series of a joint's standard deviation per axis, m
-
-The timeline `time` is the session's own: a date, or seconds if the flight has no date. Missing joints
-are left out. The viewer's pinhole has no distortion, but the pictures keep the lens's distortion.
+Entities: `world` (z up, metres) with `map`, `<person>/skeleton`, `<person>/uncertainty` (95 % ellipsoids),
+`cameras/<camera>` (its pose over time, with a pinhole and pictures in `image`) and `paths/<camera>`; the
+series `angles/<person>/<angle>` in degrees, `sigma/<person>/<joint>` in m; `doubts`, as warnings at the
+beginning. Missing joints are left out. The timeline `time` is a date, or seconds if the flight has no date.
 Recordings of the same session differ in their bytes (rerun numbers its chunks at random).
 """
 

@@ -1,31 +1,21 @@
 """Biovision's BVH: a skeleton of bones, then one line of channels per frame; reader, and export of a rig.
 
-Layout (Biovision; Meredith & Maddock, "Motion Capture File Formats Explained", 2001): `HIERARCHY`, then
-`ROOT`, `JOINT` and `End Site` blocks in braces, each with its `OFFSET` from the parent and its `CHANNELS`;
-`MOTION`, `Frames:`, `Frame Time:`, then the channels of all bones in the order of the hierarchy. Rotations
-are degrees and apply in the order in which they stand: `Zrotation Yrotation Xrotation` is Rz Ry Rx. Position
-channels replace the bone's offset (as in Blender and in the readers of published data sets), except
-if they are zero throughout.
+Layout (Meredith & Maddock, "Motion Capture File Formats Explained", 2001): `HIERARCHY`, then `ROOT`, `JOINT`
+and `End Site` blocks in braces, each with its `OFFSET` from the parent and its `CHANNELS`; `MOTION`,
+`Frames:`, `Frame Time:`, then the channels of all bones. Rotations are degrees in the order in which they
+stand: `Zrotation Yrotation Xrotation` is Rz Ry Rx. Position channels replace the bone's offset, except if
+they are zero throughout. The file states neither unit nor axes. A y-up file's (x, y, z) becomes the world's
+(z, x, y).
 
-The file states neither unit nor axes. A y-up file's (x, y, z) becomes the world's (z, x, y), as in TRC. A
-person who faces the file's +z, with the left hand towards +x, faces the world's +x (east) with the left
-towards +y.
-
-The export is a rig of constant bones that follows the skeleton. A bone has the median length over all times
-at which both its ends were measured. At rest the body stands in a T: arms to the sides, legs down, facing +x
-with the left towards +y (in a y-up file +z and +x). The rotations follow in closed form, bone by bone:
-
-- Hips are at the middle of the two hips. Their left axis is exactly the line between the hips. Their up axis
-  is as near to the direction of the neck as that allows.
-- Spine, at the same place, points exactly to the neck. Its left axis is as near to the line between
-  the shoulders as that allows.
-- Every other bone points from its joint to the next by the smallest turn from the direction its parent gives
-  it. It has no twist of its own, because joint positions do not show any. A turn of 180 degrees is about the
-  bone's own x, or y if the bone lies along x.
+The export is a rig of bones with their median measured lengths. At rest the body stands in a T, facing +x
+with the left towards +y (in a y-up file +z and +x). Rotations follow in closed form. The left axis of the
+hips is the line between them, and their up axis is as near to the neck as that allows. The spine, at the same
+place, points to the neck, its left axis as near to the line between the shoulders as that allows. Every other
+bone points to its next joint by the smallest turn from its parent's direction: positions show no twist.
 
 BVH cannot mark missing values. Times before the first and after the last known hips are left out. In between,
-unknown hips keep their last position, and a bone with a missing end keeps its last
-rotation against its parent (before the first, its first). All of this is counted.
+unknown hips keep their last position, and a bone with a missing end its last rotation. All of this is
+counted.
 """
 
 from __future__ import annotations
@@ -38,7 +28,6 @@ import numpy as np
 
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.refusals import bad_value, damaged, empty
 from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints, describe_motion
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.poses import (
@@ -51,7 +40,7 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, Recording, SkeletalMotion
-from pipelines.session.storage import read_text
+from pipelines.session.storage import bad_value, damaged, empty, read_text
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 _CMU_M = 0.0254 / 0.45
@@ -110,8 +99,7 @@ class BvhFormat:
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
         """Read every frame, the first at 0 s; `axes` is y-up unless stated.
 
-        Without a unit it is that of m, cm, mm, inch and CMU's in which the rest pose is as tall as an adult
-        (1.2 to 2.3 m): no two of them can be.
+        Without a unit it is that of m, cm, mm, inch and CMU's in which the rest pose is as tall as an adult.
         """
         contents = _read(path)
         axes = axes or "y-up"
@@ -146,9 +134,8 @@ def _likely_unit(path: Path, bones: list[_FileBone], axes: str) -> float:
 def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
     """Read a BVH file as metres with z up; `unit` is m, cm, mm or inch, `axes` y-up or z-up.
 
-    Some exports have bones above the first moving one, each with a single child (a `Reference` or scene
-    root). They are merged into it, and its motion is then the root's. If a bone further down has moving
-    position channels, it is put at their mean, if it is never further than 5 cm from it.
+    Bones above the first moving one, each with a single child (a scene root), are merged into it. A bone
+    further down with moving position channels is put at their mean, if it is never further than 5 cm from it.
     """
     if unit not in METRES:
         problem = f"the unit {unit!r} is none of {', '.join(METRES)}"
@@ -287,9 +274,9 @@ def _bones(path: Path, words: list[str]) -> list[_FileBone]:
                     above.append(None)
                     continue
                 if not name or bool(above) != (kind == "JOINT") or (above and above[-1] is None):
-                    raise _damaged(path, f"the bone {name[:40]!r} has no place there")
+                    raise damaged(path, f"the bone {name[:40]!r} has no place there")
                 if name in {bone.name for bone in bones} or len(bones) == _MOST_BONES:
-                    raise _damaged(path, f"a second bone is called {name[:40]!r}, or there are too many")
+                    raise damaged(path, f"a second bone is called {name[:40]!r}, or there are too many")
                 first = bones[-1].first_channel + len(bones[-1].channels) if bones else 0
                 parent = above[-1] if above else None
                 bones.append(_FileBone(name, -1 if parent is None else parent, np.zeros(3), [], first))
@@ -308,17 +295,13 @@ def _bones(path: Path, words: list[str]) -> list[_FileBone]:
                 named = [next(coming, "").lower() for _ in range(several)]
                 places = [channel for channel in named if channel.endswith("position")]
                 if not named or set(named) - {*_CHANNELS} or len(set(places)) < len(places):
-                    raise _damaged(path, f"CHANNELS {count} {' '.join(named)[:60]} make no sense")
+                    raise damaged(path, f"CHANNELS {count} {' '.join(named)[:60]} make no sense")
                 bones[-1].channels = named
             case _:
-                raise _damaged(path, f"{word[:60]!r} has no place in its hierarchy")
+                raise damaged(path, f"{word[:60]!r} has no place in its hierarchy")
     if above or not bones or any(bone.parent < 0 for bone in bones[1:]):
-        raise _damaged(path, "its hierarchy lacks a brace, a root or all bones")
+        raise damaged(path, "its hierarchy lacks a brace, a root or all bones")
     return bones
-
-
-def _damaged(path: Path, problem: str) -> DataError:
-    return damaged(path, problem)
 
 
 def _offset(path: Path, words: list[str]) -> Float:
@@ -327,7 +310,7 @@ def _offset(path: Path, words: list[str]) -> Float:
     except ValueError:
         offset = np.full(3, np.nan)
     if not (np.abs(offset) < _LARGEST).all():
-        raise _damaged(path, f"OFFSET {' '.join(words)[:60]} is no place")
+        raise damaged(path, f"OFFSET {' '.join(words)[:60]} is no place")
     return offset
 
 
@@ -417,8 +400,8 @@ def _made_up(name: str, rigged: Rigged, frames: int) -> str:
 def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) -> None:
     """Write a motion at the constant rate of its first and last time; `bvh.read_motion` reads it back.
 
-    The root has position and rotation channels, every other bone rotations in the order Z, X, Y (Rz Rx Ry),
-    in degrees without jumps of 360. A bone without children ends in a site of length 0.
+    The root has position and rotation channels, every other bone rotations in the order Z, X, Y, in degrees
+    without jumps of 360. A bone without children ends in a site of length 0.
     """
     order = _IN_FILE[axes]
     scale = 1 / METRES[unit]
@@ -465,8 +448,7 @@ def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) ->
 def euler_zxy_deg(quaternion_xyzw: Float) -> Float:
     """Compute angles (z, x, y) in degrees of the rotation Rz Rx Ry, [T, B, 3]; continuous over time.
 
-    From the product's entries: m21 = sin x, m01 = -sin z cos x, m11 = cos z cos x, m20 = -cos x sin y,
-    m22 = cos x cos y. If x is +-90 degrees, z and y turn about the same axis, and y is set to 0.
+    If x is +-90 degrees, z and y turn about the same axis, and y is set to 0.
     """
     m = matrix_from_quaternion(quaternion_xyzw)
     x = np.arctan2(m[..., 2, 1], np.hypot(m[..., 2, 0], m[..., 2, 2]))
@@ -597,7 +579,7 @@ def _turns(
             known = multiply(
                 conjugate(above), _frame(_between(place, "right_hip", "left_hip"), _spine(place))
             )
-        elif bone.name == "Spine" and _has_shoulders(place):
+        elif bone.name == "Spine" and {"left_shoulder", "right_shoulder"} <= place.keys():
             across = _between(place, "right_shoulder", "left_shoulder")
             known = multiply(conjugate(above), _frame(across, _spine(place), up_first=True))
         elif next_ is None:
@@ -611,10 +593,6 @@ def _turns(
             held += int(missing.sum())
             turns += frames
     return local, (held, turns)
-
-
-def _has_shoulders(place: dict[str, Float]) -> bool:
-    return {"left_shoulder", "right_shoulder"} <= place.keys()
 
 
 def _between(place: dict[str, Float], start: str, end: str) -> Float:

@@ -1,13 +1,9 @@
 """C3D, the format of biomechanics laboratories: 3D points at a constant rate, in 32-bit floats. Needs ezc3d.
 
-Layout: C3D.org's user guide (2021). A missing point has the residual -1. Any other residual measures the
-uncertainty of the point. Here it is the standard deviation per axis, sqrt(trace / 3) of its covariance, in
-whole millimetres up to 255. Header and POINT:FRAMES count to 65535; larger numbers are in
-TRIAL:ACTUAL_END_FIELD (two 16-bit words).
-
-A C3D has no time of day. Our own files give the times of their first and last frame in MOCAP:FIRST_T_NS and
-LAST_T_NS, as text because C3D's numbers are too short. Other files begin at the time of their first frame's
-number.
+A missing point has the residual -1; any other residual is here the standard deviation per axis in whole
+millimetres up to 255. Header and POINT:FRAMES count to 65535; larger numbers are in TRIAL:ACTUAL_END_FIELD
+(C3D.org's user guide, 2021). A C3D has no time of day: our own files give the times of their first and last
+frame in MOCAP:FIRST_T_NS and LAST_T_NS, as text because C3D's numbers are too short.
 """
 
 from __future__ import annotations
@@ -23,7 +19,6 @@ import numpy as np
 
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import first_bytes
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.skeletons.joint_files import (
     METRES,
     EvenMotion,
@@ -39,7 +34,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
-from pipelines.session.storage import as_data_error
+from pipelines.session.storage import as_data_error, damaged
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,8 +62,8 @@ _SCREEN_UP = {"+Z": "z-up", "+Y": "y-up"}
 class C3dFormat:
     """Reader of one person. Pose2Sim's labels get our joint names (RHip is right_hip), others keep theirs.
 
-    POINT:UNITS is used unless the user states the unit. POINT:Y_SCREEN gives the up axis (+Z or +Y);
-    without it z is up. Analog channels are not read.
+    POINT:UNITS is used unless the user states the unit, and POINT:Y_SCREEN gives the up axis; without it z is
+    up.
     """
 
     name = "c3d"

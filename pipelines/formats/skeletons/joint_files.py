@@ -1,8 +1,4 @@
-"""Files of joints: their unit and axes, the names of their markers, and a constant rate.
-
-Joints as CSV, read and written. Joint angles with standard deviations, written as CSV and as OpenSim's
-storage (STO).
-"""
+"""Files of joints: unit and axes, names of markers, a constant rate; joints as CSV, angles as CSV and STO."""
 
 from __future__ import annotations
 
@@ -21,7 +17,6 @@ from pipelines.formats.common.exporting import (
     tracks_of,
 )
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.refusals import damaged
 from pipelines.formats.common.rows import (
     SECONDS,
     Heading,
@@ -42,7 +37,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, joint_called
 from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
-from pipelines.session.storage import read_text
+from pipelines.session.storage import damaged, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,7 +67,7 @@ _UNITS = {
 def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float:
     """Convert positions [..., 3]; a point with a coordinate that is not finite is missing (all NaN).
 
-    y-up files (OpenSim, TRC) turn into world = (z, x, y), a rotation: x forward becomes y, y up becomes z.
+    y-up files (OpenSim, TRC) turn into world = (z, x, y).
     """
     if unit not in METRES:
         problem = f"the unit {unit!r} is none of {', '.join(METRES)}"
@@ -102,10 +97,9 @@ class EvenMotion:
 def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenMotion:
     """Assign a motion to frames at its usual step, from its first time (there must be one) to its last.
 
-    Every sample gets a frame, and a pause becomes empty frames. Samples within half a millisecond of their
-    frames stay as they are. If any is further off, all positions are interpolated linearly between neighbours
-    (never across a missing one), and the covariances are those of the nearest sample. Both are noted, unless
-    the stamps differ by rounding alone.
+    Samples within half a millisecond of their frames stay as they are. If any is further off, all positions
+    are interpolated linearly between neighbours (never across a missing one), with the covariances of the
+    nearest sample. Both are noted, unless the stamps differ by rounding alone.
     """
     t_ns = motion.t_ns
     if len(t_ns) == 1:
@@ -182,10 +176,7 @@ def metric_unit(stated: str) -> str:
 
 
 def marker_name(joint: str) -> str:
-    """Return Pose2Sim's and OpenSim's name of our joint: right_big_toe is RBigToe, nose is Nose.
-
-    Names that are in no skeleton of ours stay as they are.
-    """
+    """Return Pose2Sim's and OpenSim's name of our joint, RBigToe for right_big_toe; else the name itself."""
     return _MARKERS.get(joint, joint)
 
 
@@ -391,13 +382,11 @@ def _dense(path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, pos
     twice = np.flatnonzero(np.bincount(flat, minlength=cells) > 1)
     if len(twice):
         t, p, j = np.unravel_index(twice[0], shape)
-        raise DataError(
-            path,
+        problem = (
             f"{len(twice)} joints are stated more than once at one time, first {joints[j]} of person "
-            f"{persons[p]} at {t_ns[t]} ns",
-            "leave one row for each",
-            code="stated-twice",
+            f"{persons[p]} at {t_ns[t]} ns"
         )
+        raise DataError(path, problem, "leave one row for each", code="stated-twice")
     dense = np.full((cells, 3), np.nan)
     dense[flat] = position
     return JointMotion(t_ns=t_ns, joints=tuple(map(str, joints)), position=dense.reshape(*shape, 3))
@@ -456,9 +445,9 @@ _DECIMALS = 6
 class AnglesExport:
     """Writer of `<name>_angles.csv` (the session's table) and `<name>_angles.sto` (`_<person>` of several).
 
-    A STO has the angles in degrees and after them their standard deviations (`<angle>_sigma`). Its seconds
-    count from `recording.zero_ns`; the CSV keeps `t_ns`. OpenSim stops reading at a NaN: times at which an
-    angle is not known are left out of the STO, and before that angles that are rarely known.
+    A STO has the angles in degrees, then their standard deviations (`<angle>_sigma`), and seconds since
+    `recording.zero_ns`. OpenSim stops reading at a NaN: times at which an angle is not known are left out,
+    and before that angles that are rarely known.
     """
 
     name = "angles"
@@ -469,12 +458,8 @@ class AnglesExport:
         """Write both files; a person without any angle gets no STO."""
         table = recording.angles()
         if table is None or not len(table) or table["value_deg"].isna().all():
-            raise DataError(
-                recording.name,
-                "holds no joint angles to export",
-                "run `mocap reconstruct` first",
-                code="nothing-reconstructed",
-            )
+            problem, remedy = "holds no joint angles to export", "run `mocap reconstruct` first"
+            raise DataError(recording.name, problem, remedy, code="nothing-reconstructed")
         name = safe_file_name(recording.name)
         paths = [folder / f"{name}_angles.csv"]
         table.to_csv(paths[0], index=False, lineterminator="\n")

@@ -1,9 +1,8 @@
 """OpenSim's TRC: marker positions over time, tab-separated, below five header lines.
 
 Layout (OpenSim documentation, "Marker (.trc) Files"): 1 file type and name, 2 keys, 3 values (rates, counts,
-unit), 4 `Frame#`, `Time` and marker names, 5 X1 Y1 Z1 ..., an optional blank line, then one row per frame.
-Coordinates are y up by OpenSim's convention. A marker that was not seen has blank cells or NaN. We write NaN,
-because OpenSim 4.6 ignores blank cells at the end of a line and refuses a file whose last marker is missing.
+unit), 4 `Frame#`, `Time` and marker names, 5 X1 Y1 Z1 ..., then a row per frame, y up. A marker that was not
+seen has blank cells or NaN. We write NaN, because OpenSim 4.6 refuses a file whose last marker is blank.
 """
 
 import math
@@ -16,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import people_of
-from pipelines.formats.common.refusals import bad_value, damaged, empty
 from pipelines.formats.common.rows import format_seconds, median_step_ns, parse_stamps
 from pipelines.formats.skeletons.joint_files import (
     METRES,
@@ -30,7 +28,7 @@ from pipelines.formats.skeletons.joint_files import (
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
-from pipelines.session.storage import read_text
+from pipelines.session.storage import bad_value, damaged, empty, read_text
 
 # Seven decimals of a metre are below any measurement error, and rows stay readable.
 _DECIMALS = 7
@@ -109,9 +107,8 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
 class TrcExport:
     """Writer of `<name>.trc`, or `<name>_<person>.trc` for each of several people; default metres and y up.
 
-    OpenSim's (x, y, z) is our world's (y, z, x). The header states the unit; no TRC states its axes. Times
-    are seconds since `recording.zero_ns`, with nine decimals: by default since the flight's first picture,
-    because programs of biomechanics expect a trial to begin near zero.
+    OpenSim's (x, y, z) is our world's (y, z, x). Times are seconds since `recording.zero_ns`, because
+    programs of biomechanics expect a trial to begin near zero.
     """
 
     name = "trc"

@@ -26,10 +26,10 @@ _FRAME_NAMES = {"frame", "frame_id", "frame_index", "frame_number"}
 
 @dataclass(frozen=True)
 class FrameStamps:
-    """Times of frames, sorted: frame numbers and times both strictly increase; frames may be absent.
+    """Times of frames: frame numbers and times both strictly increase; frames may be absent.
 
-    `media_ns`, if present, identifies frames better than `frame` does. If a recorder skips a frame, there is
-    a gap in `media_ns` and in the video's own stamps, but not in the numbers of the video's frames.
+    `media_ns`, if present, identifies frames better than `frame` does: if a recorder skips a frame, the
+    video's own stamps have a gap, too.
     """
 
     frame: Int64  # [N] from 0
@@ -72,29 +72,19 @@ class FrameTimesFormat:
 def read_frame_times(path: Path) -> FrameStamps:
     """Read the time of each frame.
 
-    CSV (commas, semicolons or tabs) needs a header. The time is t_ns, or t, time, timestamp or stamp in
-    seconds or with a unit (`time_ms`, `timestamp [ns]`); the frame is frame, frame_id, frame_index or
-    frame_number, from 0. Without a frame column row k is frame k. Other columns are ignored.
-
-    SRT: the clock time in each subtitle, taken as UTC because DJI writes local time without its
-    zone. Frames are numbered by the subtitles' own times, so that a missing one leaves a gap.
-
-    Rows are dropped and counted under the first cause that applies: "truncated last line", "no time" (blank,
-    no number, no clock in the subtitle), "no frame number" (blank, negative, not whole), "duplicate
-    frame" (the first stays), "time not increasing" (of rows sorted by frame, each time must be above the
-    largest before it).
+    CSV needs a header with a time (`stamp_column`), and frame, frame_id, frame_index or frame_number, from 0;
+    without these row k is frame k. SRT: the clock time in each subtitle, as UTC because DJI writes no zone,
+    numbered by the subtitles' own times. Rows are counted under the first cause that applies: "truncated last
+    line", "no time", "no frame number", "duplicate frame" (the first stays), "time not increasing".
     """
     return _read_subtitles(path) if path.suffix.lower() == ".srt" else _read_csv(path)
 
 
 def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
-    """Assign a time to each frame of a video, by its presentation times [N] since its first frame.
+    """Return the times of a video's frames [N], and True where known, by their presentation times.
 
     If the stamps have `media_ns`, each frame takes the nearest one within half a frame, because subtitles
     round to a millisecond. Else frames are matched by number.
-
-    Returns:
-        [N] times, 0 if unknown, and [N] True if the time is known.
     """
     keys, wanted = stamps.frame, np.arange(len(pts_ns), dtype=np.int64)
     tolerance = 0
@@ -124,12 +114,8 @@ def _read_csv(path: Path) -> FrameStamps:
     text = read_text(path)
     found = _find_heading(text)
     if found is None:
-        raise DataError(
-            path,
-            "has no header that names the time",
-            "begin it with the line frame,t_ns (or t in seconds)",
-            code="missing-column",
-        )
+        remedy = "begin it with the line frame,t_ns (or t in seconds)"
+        raise DataError(path, "has no header that names the time", remedy, code="missing-column")
     heading, column = found
     if heading.columns == 1:
         # Blank lines count here: row k is frame k.
@@ -160,12 +146,8 @@ def _read_subtitles(path: Path) -> FrameStamps:
     known, media_ns = subtitles.has_clock, subtitles.media_ns
     start_ns = subtitles.start_ns()
     if start_ns is None:
-        raise DataError(
-            path,
-            f"its {len(media_ns)} subtitles show no clock time",
-            "state frame_times: {start: SECONDS}",
-            code="clock-unknown",
-        )
+        problem = f"its {len(media_ns)} subtitles show no clock time"
+        raise DataError(path, problem, "state frame_times: {start: SECONDS}", code="clock-unknown")
     if subtitles.are_slow:  # with whole seconds: not the time of each frame
         problem = f"shows a time every {np.median(np.diff(media_ns)) / 1e9:g} s, not for each frame"
         start = format_seconds(np.array([start_ns]))[0]

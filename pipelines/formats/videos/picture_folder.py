@@ -99,8 +99,7 @@ def read_tags(path: Path) -> Tags:
 def picture_times(tags: Sequence[Tags]) -> tuple[Int64, bool]:
     """Return the time of each picture, ns [N], 0 where it states none; True if some share a whole second.
 
-    Cameras without parts of seconds give all pictures of a second one time. These are spread evenly over it,
-    as many in the first and the last second as usual.
+    These are spread evenly over it, as many in the first and the last second as usual.
     """
     t_ns = np.array([each.t_ns or 0 for each in tags], dtype=np.int64)
     steps = np.diff(t_ns)
@@ -195,12 +194,8 @@ class PictureFolder:
             first = pictures.read(0)
             times, shared = taken_ns(path)
         if first is None:
-            raise DataError(
-                path,
-                "has a first picture that cannot be decoded",
-                "take it out of the folder",
-                code="damaged",
-            )
+            problem = "has a first picture that cannot be decoded"
+            raise DataError(path, problem, "take it out of the folder", code="damaged")
         stamps = times if times is not None else np.arange(len(pictures.files), dtype=np.int64) * 10**9
         return VideoIndex(
             pts_ns=stamps - stamps[0],
@@ -294,12 +289,9 @@ class PictureTags(DroneLog):
         """Read position, and the angles of body and gimbal, of each picture."""
         t_ns, shared, columns = _columns(path)
         if not t_ns.any():
-            raise DataError(
-                path,
-                "has pictures that say where they were taken but not when (no DateTimeOriginal in EXIF)",
-                "name another log of poses, or restore the pictures as the drone wrote them",
-                code="clock-unknown",
-            )
+            problem = "has pictures that say where they were taken but not when (no DateTimeOriginal in EXIF)"
+            remedy = "name another log of poses, or restore the pictures as the drone wrote them"
+            raise DataError(path, problem, remedy, code="clock-unknown")
         notes = ["its clock is the drone's local time, taken as UTC"]
         notes += [SHARED] if shared else []
         fixed = columns["rtk_flag"] == _RTK_FIXED

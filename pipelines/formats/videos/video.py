@@ -1,9 +1,8 @@
 """Reader of video files through FFmpeg's libraries: the exact time of every frame, and any frame exactly.
 
-Frames are numbered as a decoder gives them: from the first that it can decode, those of equal stamps each by
-itself. They are identified by their presentation stamps, because counting decoded pictures fails if one is
-damaged, and index / rate fails if the rate varies. A seek may land after the wanted frame. Raw streams have
-no stamps: their pictures are counted, and decoded from the beginning.
+Frames are numbered as a decoder gives them, from the first that it can decode, and identified by their
+presentation stamps: counting decoded pictures fails if one is damaged, and index / rate if the rate varies.
+Raw streams have no stamps: their pictures are counted, and decoded from the beginning.
 """
 
 from __future__ import annotations
@@ -20,12 +19,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from pipelines.formats.common.refusals import damaged, empty
 from pipelines.formats.common.rows import describe_times
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import UNTIMED, VideoIndex
-from pipelines.session.storage import code_of
+from pipelines.session.storage import code_of, damaged, empty
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
@@ -131,23 +129,17 @@ class VideoContainer:
     def index(self, path: Path) -> VideoIndex:
         """Read the time at which each frame is shown, from the container; only the first picture is decoded.
 
-        The largest video stream is used. Cover pictures do not count, nor frames that an edit list hides or
-        that VP8 and VP9 code for reference only. pts_ns[k] is the stamp of frame k less that of frame 0,
-        rounded to a nanosecond once; those of equal stamps are spread up to the next. Counted in `dropped`:
-        "cut off" (frames in the table after the end of the file; also the last ones shown later than the
-        first lost one, as their numbers are unknown), "no stamp", "before the first frame that can be
-        decoded".
+        The largest video stream is used, without cover pictures and frames that are hidden or only referred
+        to. pts_ns[k] is the stamp of frame k less that of frame 0; those of equal stamps are spread up to the
+        next. Counted in `dropped`: "cut off" (frames in the table after the end of the file, and the last
+        ones shown later than the first lost one), "no stamp", "before the first frame that can be decoded".
         """
         with VideoReader(path) as reader:
             return reader.index
 
 
 def created_ns(path: Path) -> int | None:
-    """Return when a video was made by its metadata, ns since the epoch; None if unknown.
-
-    MP4 and MOV hold whole seconds of UTC by definition. But some cameras write local time, and some the time
-    at which they closed the file.
-    """
+    """Return when a video was made by its metadata, ns since the epoch; None if unknown."""
     container, stream = open_container(path)
     with container:
         texts = [{**container.metadata}.get("creation_time"), {**stream.metadata}.get("creation_time")]
@@ -173,9 +165,9 @@ def frames(
 def black_bars(path: Path) -> tuple[int, int, int, int]:
     """Count the black columns at the left, rows at the top, columns at the right and rows at the bottom.
 
-    Their brightness is on average below 16 of 255, which leaves room for a codec's noise, in each of five
-    pictures from all over the video. It is that of all channels as the eye weighs them: codecs halve the
-    resolution of colours, so these bleed into a bar.
+    They are darker than 16 of 255 on average, in five pictures from all over the video. The brightness is
+    that of all channels as the eye weighs them: codecs halve the resolution of colours, so these bleed into a
+    bar.
     """
     with VideoReader(path) as reader:
         last = reader.index.count - 1
@@ -195,8 +187,8 @@ def black_bars(path: Path) -> tuple[int, int, int, int]:
 class VideoReader:
     """Open video with its `index`; frames are read by number, in any order. A context manager.
 
-    Pictures are BGR, turned as in players and OpenCV, so that their size is that of the index. `missing`
-    holds the numbers of the undecodable frames found so far.
+    Pictures are BGR, turned as in players, as large as the index says. `missing` holds the numbers of the
+    undecodable frames found so far.
     """
 
     index: VideoIndex
@@ -226,12 +218,9 @@ class VideoReader:
             raise DataError(path, f"none of its {count} frames can be decoded", "export it again, as MP4")
         if _is_mirrored(self._next[1]):
             self.close()
-            raise DataError(
-                path,
-                "shows its pictures mirrored (by its display matrix)",
-                "export it again, so that its pictures are as the lens saw them",
-                code="unsupported",
-            )
+            problem = "shows its pictures mirrored (by its display matrix)"
+            remedy = "export it again, so that its pictures are as the lens saw them"
+            raise DataError(path, problem, remedy, code="unsupported")
         self.index = _index(self._scan, self._stream, self._next[1])
 
     def __enter__(self) -> Self:
@@ -253,8 +242,7 @@ class VideoReader:
     def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[tuple[int, Picture]]:
         """Yield numbers and pictures of frames start, start + step, ... before stop (default: all).
 
-        Frames that cannot be decoded are skipped; the others keep their numbers. Several iterations may
-        alternate.
+        Frames that cannot be decoded are skipped. Several iterations may alternate.
         """
         count = self.index.count
         last = count if stop is None else stop
@@ -510,7 +498,8 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
     if not streams:
         container.close()
         raise _unreadable(path, kind, "holds no video stream")
-    known = [s for s in streams if _has_decoder(s)]
+    # None for an unknown codec, despite its annotation.
+    known = [s for s in streams if s.codec_context is not None]  # type: ignore[redundant-expr]
     if not known:
         container.close()
         raise DataError(path, "is coded in a way that FFmpeg cannot decode", "export it again, as H.264")
@@ -522,11 +511,6 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
     # Not frame by frame: then the output for a damaged frame would depend on the number of processors.
     stream.thread_type = "SLICE"
     return container, stream
-
-
-def _has_decoder(stream: VideoStream) -> bool:
-    context: object = stream.codec_context  # None for an unknown codec, despite its annotation
-    return context is not None
 
 
 def _unreadable(path: Path, kind: str, problem: str) -> DataError:
@@ -552,12 +536,8 @@ def _kind(path: Path) -> str:
     if not size:
         raise empty(path, "is empty")
     if kind is None:
-        raise DataError(
-            path,
-            "is no video container that is known here",
-            "export it as MP4",
-            code="wrong-kind",
-        )
+        problem = "is no video container that is known here"
+        raise DataError(path, problem, "export it as MP4", code="wrong-kind")
     return kind
 
 
@@ -617,9 +597,8 @@ def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[V
 def is_shown(packet: Packet[VideoStream], codec: str) -> bool:
     """Test if a coded frame gives a picture.
 
-    VP8 and VP9 code frames that are only referred to (alternate reference frames); some writers store them as
-    packets of their own. VP8: RFC 6386, section 9.1. VP9: bitstream specification 0.6, section 6.2 and annex
-    B.
+    VP8 and VP9 code frames that are only referred to. VP8: RFC 6386, section 9.1. VP9: bitstream
+    specification 0.6, section 6.2 and annex B.
     """
     if codec not in {"vp8", "vp9"}:
         return True

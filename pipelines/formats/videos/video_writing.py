@@ -42,14 +42,10 @@ def write_h264(
     height: int,
     bits_per_s: int | None = None,
 ) -> None:
-    """Encode pictures [height, width, 3] BGR as an H.264 MP4, 4:2:0, in one thread.
+    """Encode pictures [height, width, 3] BGR (even sides) as an H.264 MP4, 4:2:0, in one thread.
 
-    Args:
-        pictures: as many as stamps.
-        pts_ns: [N] strictly increasing times of showing, at least 0.
-        width: of the pictures, even.
-        height: of the pictures, even.
-        bits_per_s: a mean rate over a second; by default the quality is constant.
+    `pts_ns` [N] are strictly increasing times of showing, at least 0. Without `bits_per_s` the quality is
+    constant.
     """
     import av
 
@@ -74,8 +70,8 @@ class H264Stream:
     """Encoder of the pictures of one camera for logs: one access unit of H.264 (Annex B) for each picture.
 
     There are no B frames, and every key frame carries its parameter sets, as foxglove.CompressedVideo and
-    Rerun's VideoStream want it. All pictures have the size of the first, at most 960 px wide, made even. One
-    thread: the same pictures give the same bytes.
+    Rerun's VideoStream want it. Pictures are at most 960 px wide, made even. The same pictures give the same
+    bytes.
     """
 
     def __init__(self) -> None:
@@ -162,26 +158,14 @@ class OverlayExport:
     title: str = "the skeleton over every picture (MP4); overlay:left_knee+right_elbow adds joint angles"
 
     def configured(self, argument: str) -> OverlayExport:
-        """Return the export that writes angles, which are named with `+` between them.
-
-        Raises:
-            DataError: there is no such angle.
-        """
+        """Return the export that writes angles, with `+` between their names; DataError for unknown ones."""
         return replace(self, angles=tuple(dict.fromkeys(map(_angle_named, argument.split("+")))))
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write the video of every camera that has pictures.
-
-        Raises:
-            DataError: there is no skeleton, or no camera has pictures.
-        """
+        """Write the video of every camera that has pictures; DataError without a skeleton or pictures."""
         if recording.motion is None:
-            raise DataError(
-                recording.name,
-                "holds no skeleton to draw",
-                "run `mocap reconstruct` first",
-                code="nothing-reconstructed",
-            )
+            problem, remedy = "holds no skeleton to draw", "run `mocap reconstruct` first"
+            raise DataError(recording.name, problem, remedy, code="nothing-reconstructed")
         written = []
         for camera in recording.cameras:
             film = recording.film(camera, self.angles, recording.progress)
@@ -189,12 +173,8 @@ class OverlayExport:
                 written.append(folder / f"{camera}.overlay.mp4")
                 _write_video(written[-1], *film)
         if not written:
-            raise DataError(
-                recording.name,
-                "has no pictures to draw on",
-                "state the cameras' `video` in flight.yaml, and ingest it",
-                code="no-pictures",
-            )
+            remedy = "state the cameras' `video` in flight.yaml, and ingest it"
+            raise DataError(recording.name, "has no pictures to draw on", remedy, code="no-pictures")
         return sorted(written)
 
 
