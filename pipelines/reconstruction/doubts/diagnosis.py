@@ -62,8 +62,11 @@ SCATTERED = 0.65
 MISSED = 1.8
 """Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights."""
 
-STRAINED = 10.0
-"""Chi^2 of constant errors of poses from which numbers of one camera are tried."""
+STRAINED = 15.0
+"""Chi^2 of constant errors of poses from which numbers of one camera are tried.
+
+An angle or a factor that the rays make thirty times surer costs 7 of it, and must gain 9 more to be named.
+"""
 
 STRANGE = 5.0
 """Standard deviations from which one oddity is said, whatever the score."""
@@ -184,24 +187,21 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     mirrored = any(found.odd[name].sigmas >= STRANGE for name in ("face", "bend") if name in found.odd)
     fits = found.misfit < MISSED and found.scatter < SCATTERED and not mirrored
     objective = Objective(trial, base)
-    clocks = [objective.best_clock([index]) for index in trial.every]
-    tried = [
-        *_of_logs(objective),
-        *_of_turns(objective, late),
-        *clocks,
-        *map(objective.scored, alternatives.rates(trial)),
-    ]
+    tried: list[Tried | None] = [*_of_logs(objective), *_of_turns(objective, late)]
     strange = _is_strange(found)
     odd = strange or base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
     if odd:
         tried += map(objective.scored, alternatives.discrete(trial))
         tried += map(objective.with_numbers, alternatives.numbers_of_all(trial))
-        tried += [objective.best_clock(trial.every)] if trial.moving else []
     if strange and np.isfinite(found.stature_m):
         tried.append(objective.scored(alternatives.scale(trial, found.stature_m)))
     if odd or objective.described.strain >= STRAINED:
         tried += map(objective.with_numbers, alternatives.numbers_of_one(trial))
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
+    # Times come last, since most of them need no exact score beside what fits by then.
+    tried += map(objective.scored, alternatives.rates(trial))
+    tried += [objective.best_clock([index]) for index in trial.every]
+    tried += [objective.best_clock(trial.every)] if odd and trial.moving else []
     causes = _causes(objective, [each for each in tried if each is not None], odd)
     if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
         level = alternatives.level(trial, solve(trial.described).joints) if fits else ()

@@ -297,31 +297,34 @@ def scene_of(
 
     Args:
         flight: the flight.
-        posed: a scene of it, whose poses are taken.
+        posed: the scene as described, of which everything else is taken.
         late_s: [C] added to the times of each camera's pictures.
         slower: [C] factor of the times between each camera's pictures.
         order: whose pictures each camera has; its own by default.
         pixels: other pixels [F, J, 2] of each camera's pictures.
     """
     cameras = flight.cameras
-    rays, person_px, unposed = [], [], []
+    rays, person_px, unposed = np.empty((len(cameras), len(flight.t_ns), len(JOINTS), 2)), [], []
     for index, camera in enumerate(cameras):
         source = cameras[index if order is None else order[index]]
         seen = source.pixels if pixels is None else pixels[index]
+        late, factor = 0.0 if late_s is None else late_s[index], 1.0 if slower is None else slower[index]
+        if posed is not None and seen is camera.pixels and (late, factor) == (0.0, 1.0):
+            rays[index] = posed.rays[index]
+            person_px.append(posed.person_px[index])
+            unposed.append(posed.unposed[index])
+            continue
         since = (source.t_ns - flight.t_ns[0]).astype(np.float64)
-        if slower is not None:
-            first = float(source.entry.frames.first_t_ns - flight.t_ns[0])  # few may have been looked at
-            since = first + (since - first) * slower[index]
-        if late_s is not None:
-            since = since + late_s[index] * 1e9
+        first = float(source.entry.frames.first_t_ns - flight.t_ns[0])  # few may have been looked at
+        since = first + (since - first) * factor + late * 1e9
         unposed.append(_outside(since + flight.t_ns[0], camera, flight.between))
         at = _interpolated(since, seen, (flight.t_ns - flight.t_ns[0]).astype(np.float64))
-        rays.append(undistort(at, camera.intrinsics))
+        rays[index] = undistort(at, camera.intrinsics)
         row = at[..., 1]
         person_px.append(median(np.fmax.reduce(row, axis=1) - np.fmin.reduce(row, axis=1)))
     position, rotation = (posed.position, posed.rotation) if posed else _poses(flight)
     return SceneOfMoments(
-        np.array(rays),
+        rays,
         position,
         rotation,
         np.array([(camera.intrinsics.fx + camera.intrinsics.fy) / 2 for camera in cameras]),

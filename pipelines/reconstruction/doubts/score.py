@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.reconstruction.doubts.scene import (
     JOINTS,
@@ -90,30 +91,75 @@ def _directions(scene: SceneOfMoments) -> Float:
     return direction
 
 
-@np.errstate(invalid="ignore")
 def solve(scene: SceneOfMoments) -> SolvedJoints:
     """Triangulate by least squares of distances to rays, weighted by what keypoints and poses err by."""
     direction = _directions(scene)
-    centre = scene.position[:, :, None]
-    seen: Bool = np.asarray(np.isfinite(direction).all(axis=-1) & np.isfinite(centre).all(axis=-1))
-    direction, centre = np.where(seen[..., None], direction, 0.0), np.nan_to_num(centre)
+    seen: Bool = np.isfinite(direction[..., 0] + scene.position.sum(axis=-1)[..., None])
+    direction, centre = np.where(seen[..., None], direction, 0.0), np.nan_to_num(scene.position)
+    angle2 = pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2
     views = seen.sum(axis=0)
-    angle2 = (pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2)[:, None, None]
-    place2 = (scene.sigma[:, 0] ** 2)[:, None, None]
-    across = centre - direction * (direction * centre).sum(axis=-1, keepdims=True)
-    depth = np.full(seen.shape, _FIRST_M)
-    by_joint = direction.transpose(1, 2, 3, 0)  # [T, J, 3, C]
-    for _ in range(2):
-        weight = seen / (np.clip(np.abs(depth), _NEAREST_M, _FARTHEST_RAY_M) ** 2 * angle2 + place2)
-        total = (weight.sum(axis=0) * (1 + _FIRM) + 1e-30)[..., None, None] * np.eye(3)
-        matrix = total - (by_joint * weight.transpose(1, 2, 0)[:, :, None]) @ np.swapaxes(by_joint, 2, 3)
-        point = np.linalg.solve(matrix, (weight[..., None] * across).sum(axis=0)[..., None])[..., 0]
-        toward = point - centre
-        depth = (toward * direction).sum(axis=-1)
-    apart2 = ((toward - depth[..., None] * direction) ** 2).sum(axis=-1)
+    joints, chi2, depth = _meet(direction, centre, seen, angle2, scene.sigma[:, 0] ** 2)
+    joints[views < 2] = np.nan
     in_front: Bool = np.asarray(((depth > 0) | ~seen).all(axis=0))
-    joints = np.where((views >= 2)[..., None], point, np.nan)
-    return SolvedJoints(joints, (apart2 * weight).sum(axis=0), views, in_front, direction, seen, depth * seen)
+    return SolvedJoints(joints, chi2, views, in_front, direction, seen, depth)
+
+
+@helper
+def _inverse(m: Float, inverse: Float) -> None:
+    """Invert a symmetric matrix [3, 3] in place of another."""
+    inverse[0, 0], inverse[1, 1] = m[1, 1] * m[2, 2] - m[1, 2] ** 2, m[0, 0] * m[2, 2] - m[0, 2] ** 2
+    inverse[0, 1] = inverse[1, 0] = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    inverse[0, 2] = inverse[2, 0] = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+    inverse[1, 2] = inverse[2, 1] = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]
+    inverse[2, 2] = m[0, 0] * m[1, 1] - m[0, 1] ** 2
+    inverse /= m[0, 0] * inverse[0, 0] + m[0, 1] * inverse[0, 1] + m[0, 2] * inverse[0, 2]
+
+
+@cached
+def _meet(
+    direction: Float, centre: Float, seen: Bool, angle2: Float, place2: Float
+) -> tuple[Float, Float, Float]:
+    """Return the joints [T, J, 3] nearest to rays, their chi^2 [T, J] and depths [C, T, J]; 0 if unseen."""
+    cameras, times, names = seen.shape
+    joints, chi2, depth = np.zeros((times, names, 3)), np.zeros((times, names)), np.zeros(seen.shape)
+    matrix, inverse, right, weights = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(cameras)
+    for t in range(times):
+        for j in range(names):
+            for second in range(2):
+                matrix[:], right[:], chi2[t, j] = 0.0, 0.0, 0.0
+                for c in range(cameras):
+                    if not seen[c, t, j]:
+                        continue
+                    away = min(max(abs(depth[c, t, j]), _NEAREST_M), _FARTHEST_RAY_M) if second else _FIRST_M
+                    weights[c] = 1 / (away**2 * angle2[c] + place2[c])
+                    along = 0.0
+                    for i in range(3):
+                        along += direction[c, t, j, i] * centre[c, t, i]
+                    for i in range(3):
+                        ray = weights[c] * direction[c, t, j, i]
+                        right[i] += weights[c] * centre[c, t, i] - ray * along
+                        matrix[i, i] += weights[c] * (1 + _FIRM) + 1e-30
+                        for k in range(3):
+                            matrix[i, k] -= ray * direction[c, t, j, k]
+                if matrix[0, 0] == 0.0:
+                    continue
+                _inverse(matrix, inverse)
+                for i in range(3):
+                    joints[t, j, i] = (
+                        inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
+                    )
+                for c in range(cameras):
+                    if not seen[c, t, j]:
+                        continue
+                    along, apart2 = 0.0, 0.0
+                    for i in range(3):
+                        along += (joints[t, j, i] - centre[c, t, i]) * direction[c, t, j, i]
+                    for i in range(3):
+                        apart = joints[t, j, i] - centre[c, t, i] - along * direction[c, t, j, i]
+                        apart2 += apart * apart
+                    depth[c, t, j] = along
+                    chi2[t, j] += weights[c] * apart2
+    return joints, chi2, depth
 
 
 @dataclass(frozen=True)
@@ -179,6 +225,104 @@ def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Fl
     return (toward - along[..., None] * direction) / far[..., None], far
 
 
+@helper
+def _missed(joint: Float, place: Float, ray: Float, axis: int) -> float:
+    """Return by how much a ray misses a joint along an axis, over its depth."""
+    along = 0.0
+    for i in range(3):
+        along += (joint[i] - place[i]) * ray[i]
+    missed: float = (joint[axis] - place[axis] - along * ray[axis]) / max(abs(along), _NEAR_M)
+    return missed
+
+
+@cached
+def _linear(
+    joints: Float,
+    place: Float,
+    ray: Float,
+    probed_place: Float,
+    probed_ray: Float,
+    root: Float,
+    placed: Float,
+    pull: Float,
+) -> tuple[Float, Float, Float]:
+    """Linearise the misses of rays, and solve for the joints.
+
+    Args:
+        joints: [T, J, 3].
+        place: [C, T, 3] of the cameras.
+        ray: [C, T, J, 3].
+        probed_place: [n, C, T, 3] with each number changed by a step.
+        probed_ray: [n, C, T, J, 3].
+        root: [C, T, J] square roots of the weights; 0 of what is not used.
+        placed: [T, J] weights of known places of joints.
+        pull: [T, J, 3] towards them, times the weight.
+
+    Returns:
+        Weighted derivatives [C, 3 T J, 6 + n + 1] by each camera's shift and turn, by the numbers, and the
+        misses; those by the joints times these [3 T J, 6 C + n + 1]; and this with the joints solved.
+    """
+    cameras, times, names = root.shape
+    numbers = len(probed_ray)
+    width = 6 * cameras + numbers + 1
+    rows = np.zeros((cameras, 3 * times * names, 7 + numbers))
+    both = np.zeros((3 * times * names, width))
+    solution = np.zeros((3 * times * names, width))
+    matrix, inverse, by_joint = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    for t in range(times):
+        for j in range(names):
+            first = 3 * (t * names + j)
+            matrix[:] = 0.0
+            for i in range(3):
+                matrix[i, i] = placed[t, j] + _FIRM
+                both[first + i, width - 1] = -pull[t, j, i]
+            for c in range(cameras):
+                if root[c, t, j] == 0.0:
+                    continue
+                d, weight = ray[c, t, j], root[c, t, j]
+                along = 0.0
+                for i in range(3):
+                    along += (joints[t, j, i] - place[c, t, i]) * d[i]
+                far = max(abs(along), _NEAR_M)
+                farther = np.sign(along) if abs(along) > _NEAR_M else 0.0
+                for i in range(3):
+                    row = rows[c, first + i]
+                    missed = _missed(joints[t, j], place[c, t], d, i)
+                    for k in range(3):
+                        by_joint[i, k] = weight * ((i == k) - d[i] * d[k] - missed * farther * d[k]) / far
+                        row[k] = -by_joint[i, k]
+                        # The ray turns about axis k, by the product of that with the ray.
+                        one, other = (k + 1) % 3, (k + 2) % 3
+                        turn = 0.0
+                        if i == one:
+                            turn = -d[other]
+                        elif i == other:
+                            turn = d[one]
+                        nearer = (joints[t, j, other] - place[c, t, other]) * d[one]
+                        nearer -= (joints[t, j, one] - place[c, t, one]) * d[other]
+                        row[3 + k] = -weight * (along * turn + nearer * (d[i] + missed * farther)) / far
+                    for k in range(numbers):
+                        moved = _missed(joints[t, j], probed_place[k, c, t], probed_ray[k, c, t, j], i)
+                        row[6 + k] = weight * (moved - missed) / _PROBE
+                    row[6 + numbers] = weight * missed
+                for i in range(3):
+                    for k in range(3):
+                        for m in range(3):
+                            matrix[i, k] += by_joint[m, i] * by_joint[m, k]
+                    for m in range(3):
+                        row = rows[c, first + m]
+                        for k in range(6):
+                            both[first + i, 6 * c + k] += by_joint[m, i] * row[k]
+                        for k in range(numbers + 1):
+                            both[first + i, 6 * cameras + k] += by_joint[m, i] * row[6 + k]
+            _inverse(matrix, inverse)
+            for i in range(3):
+                for k in range(width):
+                    for m in range(3):
+                        solution[first + i, k] += inverse[i, m] * both[first + m, k]
+    return rows, both, solution
+
+
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _step(
     flight: Sampled, make: Make, numbers: Float, errors: Float, loose: Sequence[float]
@@ -209,46 +353,24 @@ def _step(
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
     cost = float((np.where(used, huber, 0.0) / seen).sum()) + strain
 
-    root = np.where(used, np.sqrt(weight), 0.0)[..., None]
-
-    def slope(changed: tuple[Float, Float]) -> Float:
-        return root * (changed[0] - missed) / _PROBE
-
-    def stacked(slopes: list[Float]) -> Float:
-        """Return weighted derivatives [C, T J, 3, n]."""
-        return np.stack(slopes, axis=-1).reshape(len(errors), -1, 3, len(slopes))
-
-    probes = _PROBE * np.eye(3)
-    point = stacked([slope(_misses(joints + each, place, solved.direction)) for each in probes])
-    turned = np.cross(_PROBE * np.eye(3)[:, None, None, None], solved.direction)
-    moves = [slope(_misses(joints, place + each, solved.direction)) for each in probes]
-    own = stacked(moves + [slope(_misses(joints, place, solved.direction + each)) for each in turned])
-    of_numbers, of_size = [], np.zeros(unknowns)
+    probed_place, probed_ray = np.zeros((len(numbers), *place.shape)), np.zeros((len(numbers), *missed.shape))
+    of_size = np.zeros(unknowns)
     for k, probe in enumerate(_PROBE * np.eye(len(numbers))):
         probed = _with_errors(make(numbers + probe), errors)
-        direction = np.where(used[..., None], _directions(probed), 0.0)
-        of_numbers.append(slope(_misses(joints, np.nan_to_num(probed.position), direction)))
+        probed_ray[k] = np.where(used[..., None], _directions(probed), 0.0)
+        probed_place[k] = np.nan_to_num(probed.position)
         of_size[errors.size + k] = (size_sigmas(solve(probed).joints) - sized) / _PROBE
-    shared = stacked(of_numbers) if of_numbers else np.zeros((*own.shape[:3], 0))
-
     # Each camera has its own errors; the numbers are shared by all; the joints are eliminated.
-    left = (root * missed).reshape(*own.shape[:3], 1)
-    of_joint = np.swapaxes(point, -1, -2)
-    mixed = np.moveaxis(of_joint @ own, 0, 2).reshape(own.shape[1], 3, -1)
-    both = np.concatenate([mixed, (of_joint @ shared).sum(axis=0)], axis=-1)
-    at_joint = (of_joint @ left).sum(axis=0) - pull.reshape(-1, 3, 1)
-    firm = (placed.reshape(-1, 1, 1) + _FIRM) * np.eye(3)
-    joined = np.concatenate([both, at_joint], axis=-1)
-    solution = np.linalg.solve((of_joint @ point).sum(axis=0) + firm, joined).reshape(-1, unknowns + 1)
-    coupled = both.reshape(-1, unknowns).T @ solution
-    normal, right = -coupled[:, :-1], -coupled[:, -1]
+    rows, both, solution = _linear(
+        joints, place, solved.direction, probed_place, probed_ray, np.sqrt(weight), placed, pull
+    )
+    coupled = both.T @ solution
+    normal, right = -coupled[:-1, :-1], -coupled[:-1, -1]
     for camera in range(len(errors)):
-        rows = np.concatenate([own[camera], shared[camera], left[camera]], axis=-1)
-        rows = rows.reshape(-1, rows.shape[-1])
-        product = rows[:, :-1].T @ rows
+        product = rows[camera].T @ rows[camera]
         place_of = [*range(6 * camera, 6 * camera + 6), *range(errors.size, unknowns)]
-        normal[np.ix_(place_of, place_of)] += product[:, :-1]
-        right[place_of] += product[:, -1]
+        normal[np.ix_(place_of, place_of)] += product[:-1, :-1]
+        right[place_of] += product[:-1, -1]
     free = np.asarray(loose, dtype=np.float64)
     inverse = np.concatenate([1 / sigma.ravel() ** 2, 1 / free**2])
     normal += np.diag(inverse + 1e-9) + np.outer(of_size, of_size)
@@ -453,43 +575,87 @@ def _scatter(scene: SceneOfMoments, solved: SolvedJoints) -> float:
 
 
 def _scatter_of_pair(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
-    """Fit constant errors of both poses to the rays' distances, and measure what they leave.
-
-    The distance along the common normal changes by the normal with a shift of a camera, and by the lever
-    (distance times ray) across the normal with a turn.
-    """
-    one, other = pair
-    normal = np.cross(solved.direction[one], solved.direction[other])
-    length = np.linalg.norm(normal, axis=-1)
-    used = solved.seen[one] & solved.seen[other] & (length > _PARALLEL)
-    if used.sum() < _FEWEST:
+    """Fit constant errors of both poses to the rays' distances, and measure what they leave."""
+    chosen, shape = list(pair), solved.seen.shape[1:]
+    used, design, apart, noise2 = _crossings(
+        solved.direction[chosen],
+        solved.depth[chosen],
+        solved.seen[chosen],
+        scene.position[chosen],
+        scene.rotation[chosen],
+        scene.sigma[chosen],
+        pixel_variance(scene)[chosen] / scene.focal_px[chosen] ** 2,
+    )
+    if len(used) < _FEWEST:
         return None
-    normal = normal[used] / length[used][:, None]
-    time = np.nonzero(used)[0]
-    apart = (normal * (scene.position[other] - scene.position[one])[time]).sum(axis=-1)
-    parts, noise2 = [], np.zeros(len(time))
-    for camera, sign in ((one, -1.0), (other, 1.0)):
-        away = np.clip(np.abs(solved.depth[camera][used]), 1e-4, 1e5)
-        place_m, turn_rad, white_m, white_rad = scene.sigma[camera, :4]
-        lever = np.cross(solved.direction[camera][used], normal) * (sign * turn_rad * away)[:, None]
-        parts += [
-            sign * place_m * normal,
-            (lever[:, None] @ scene.rotation[camera][time])[:, 0],
-        ]
-        noise2 += away**2 * pixel_variance(scene)[camera] / scene.focal_px[camera] ** 2
-        # What is new in every pose turns the person in the picture, besides moving them.
-        noise2 += _HALF_BODY_M**2 * white_rad**2 + (_HALF_BODY_M * white_m / np.maximum(away, 1.0)) ** 2
-    design, noise = np.column_stack(parts), np.sqrt(median(noise2))
-    share = used.shape[0] / len(apart)  # a picture is one observation of a constant error
+    noise = np.sqrt(median(noise2))
+    share = shape[0] / len(apart)  # a picture is one observation of a constant error
     weight = np.ones(len(apart))
     for _ in range(3):
         weighted = design * (weight * share / noise**2)[:, None]
         constant = np.linalg.solve(weighted.T @ design + np.eye(design.shape[1]), weighted.T @ apart)
         left = apart - design @ constant
         weight = 1 / np.maximum(np.abs(left) / (1.5 * noise), 1.0)
-    residual = np.full(used.shape, np.nan)
-    residual[used] = left
+    residual = np.full(shape, np.nan)
+    residual.ravel()[used] = left
     return float(1.48 * median(np.abs(residual - _median_of_rows(residual)[:, None])) / noise)
+
+
+@cached
+def _crossings(
+    ray: Float, depth: Float, seen: Bool, place: Float, rotation: Float, sigma: Float, pixel2: Float
+) -> tuple[Int64, Float, Float, Float]:
+    """Compare the rays of two cameras along their common normals.
+
+    That distance changes by the normal with a shift of a camera, and by the lever (distance times ray) across
+    the normal with a turn.
+
+    Args:
+        ray: [2, T, J, 3] in the world.
+        depth: [2, T, J] m.
+        seen: [2, T, J].
+        place: [2, T, 3] m of the cameras.
+        rotation: [2, T, 3, 3] world_from_camera.
+        sigma: [2, 6] as `PoseSigma`.
+        pixel2: [2] variances of keypoints, rad^2.
+
+    Returns:
+        Indices [N] of joints whose rays cross; the derivatives [N, 12] of their distances by shift and turn
+        of each camera, in standard deviations; the distances [N] m and their variances [N] m^2.
+    """
+    _, times, names = seen.shape
+    used, design = np.zeros(times * names, np.int64), np.zeros((times * names, 12))
+    apart, noise2, normal, count = np.zeros(times * names), np.zeros(times * names), np.zeros(3), 0
+    for t in range(times):
+        for j in range(names):
+            if not (seen[0, t, j] and seen[1, t, j]):
+                continue
+            a, b, length2 = ray[0, t, j], ray[1, t, j], 0.0
+            for i in range(3):
+                normal[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]
+                length2 += normal[i] ** 2
+            if length2 <= _PARALLEL**2:
+                continue
+            normal /= np.sqrt(length2)
+            used[count] = t * names + j
+            for i in range(3):
+                apart[count] += normal[i] * (place[1, t, i] - place[0, t, i])
+            for c in range(2):
+                sign, away = 2 * c - 1, min(max(abs(depth[c, t, j]), 1e-4), 1e5)
+                for i in range(3):
+                    one, other = (i + 1) % 3, (i + 2) % 3
+                    lever = ray[c, t, j, one] * normal[other] - ray[c, t, j, other] * normal[one]
+                    design[count, 6 * c + i] = sign * sigma[c, 0] * normal[i]
+                    for k in range(3):
+                        design[count, 6 * c + 3 + k] += (
+                            sign * sigma[c, 1] * away * lever * rotation[c, t, i, k]
+                        )
+                noise2[count] += away**2 * pixel2[c]
+                # What is new in every pose turns the person in the picture, besides moving them.
+                noise2[count] += (_HALF_BODY_M * sigma[c, 3]) ** 2
+                noise2[count] += (_HALF_BODY_M * sigma[c, 2] / max(away, 1.0)) ** 2
+            count += 1
+    return used[:count], design[:count], apart[:count], noise2[:count]
 
 
 def _median_of_rows(values: Float) -> Float:
