@@ -172,10 +172,12 @@ def versions_of(folder: Path) -> dict[str, dict[str, str]]:
 
 
 def note_sources(session: Path, hashes: Mapping[str, str], stamps: Mapping[str, str]) -> None:
-    """Note in run.json each source's content hash with its stamp; both mappings are by the source's name."""
-    noted = {name: {"sha256": digest, "stamp": stamps[name]} for name, digest in hashes.items()}
-    if noted != _read(session).get("sources"):
-        _write(session, {"sources": noted})
+    """Note in run.json where the session lies, and each source's content hash with its stamp, by its name."""
+    sources = {name: {"sha256": digest, "stamp": stamps[name]} for name, digest in hashes.items()}
+    noted = {"sources": sources, "folder": str(session.absolute())}
+    known = _read(session)
+    if any(known.get(key) != value for key, value in noted.items()):
+        _write(session, noted)
 
 
 def noted_stamps(session: Path, hashes: Mapping[str, str]) -> dict[str, str]:
@@ -655,3 +657,11 @@ def origin_of(folder: Path) -> Path:
     """Return the folder to which the paths in a session are relative: of a copy, that of the original."""
     note = folder / _ORIGIN
     return Path(str(read_json(note).get("session", folder))) if note.is_file() else folder
+
+
+def first_place_of(folder: Path) -> Path:
+    """Return the folder in which a session was ingested, as run.json notes it; else the folder itself."""
+    try:
+        return Path(str(_read(folder).get("folder", folder)))
+    except DataError:
+        return folder

@@ -21,7 +21,7 @@ from filelock import FileLock
 
 from pipelines.session.errors import DataError, MocapError
 from pipelines.session.registries import need
-from pipelines.session.stages import origin_of
+from pipelines.session.stages import first_place_of, origin_of
 from pipelines.session.storage import (
     as_data_error,
     hash_of,
@@ -71,10 +71,15 @@ def url_of(place: Path | str) -> str | None:
 def located(base: Path, stated: str | Path) -> Path:
     """Return the path of a file or folder stated by a path relative to `base`, or by URL, which is fetched.
 
-    If `base` itself was fetched, the path is relative to its URL. DataError if the store cannot be read.
+    If `base` itself was fetched, the path is relative to its URL; if it is a session that was copied without
+    its sources, to where it was ingested. DataError if the store cannot be read.
     """
     url = source_url(base, stated)
-    return origin_of(base) / stated if url is None else fetched(url)
+    if url is not None:
+        return fetched(url)
+    origin = origin_of(base)
+    path = origin / stated
+    return path if path.exists() or not (left := first_place_of(origin) / stated).exists() else left
 
 
 def source_url(base: Path, stated: str | Path) -> str | None:

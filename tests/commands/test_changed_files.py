@@ -127,6 +127,14 @@ def test_another_clock_keeps_the_keypoints_at_new_times(flight: Path, tmp_path: 
     assert content(session) == before
 
 
+def test_a_session_copied_without_its_videos_finds_them_where_it_was_ingested(
+    detected: Path, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(detected / "flight.session", tmp_path / "far" / "away" / "copy.session"))
+    succeeds("reconstruct", copy, "--method", "robust", "--detector", spot_detector(detected), "--force")
+    assert content(copy) == content(detected / "flight.session")
+
+
 class Meddler(Silent):
     """Progress that calls a function at a step."""
 
