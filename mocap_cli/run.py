@@ -38,6 +38,7 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
     A flight.yaml that is there is taken as it is. What no file tells is asked in a terminal, at most three
     questions with the likely answer first. Elsewhere --yes takes the likely answer. Planners are compared
     where the flight has a map and an actor. The same command again continues: what is finished is skipped.
+    A draft is made again when files were added or something is missing in it, unless you edited it.
     """
     from pipelines.run import drafted, run
 
@@ -49,6 +50,7 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
         questions.confirm(manifest, remark)
     with watching(shown.level) as progress:
         result = run(manifest, workers=workers, progress=progress)
+    assumed = assumed or result.assumed
     verdict: dict[str, Any] = result.reconstructed.metrics["verdict"]
     if shown.as_json:
         print_json(
@@ -70,20 +72,20 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
 
 
 class _Questions:
-    """Questions to somebody at a terminal; elsewhere the likely answer is taken where that was asked for."""
+    """Questions to somebody at a terminal; after the last one the likely answers are taken, as with --yes."""
 
     def __init__(self, asks: bool, *, takes: bool) -> None:
         self.left = MAX_QUESTIONS if asks else 0
-        self._takes = takes
+        self._takes = takes or asks
 
     def choose(self, question: Question) -> Answer | None:
-        """Let somebody choose an option; none is chosen after too many questions, and where nobody is."""
+        """Let somebody choose an option; None leaves it open."""
         from pipelines.drafting.matching import Answer
 
         if not self.left:
             return Answer(0, stated=False) if self._takes else None
         self.left -= 1
-        say(f"cameras.{question.camera}.{question.key}: no file tells it. It may be", err=True)
+        say(f"{question.key} of {', '.join(question.cameras)}: no file tells it. It may be", err=True)
         for number, option in enumerate(question.options, 1):
             say(f"  {number}: {one_line(option)}", err=True)
         numbers = click.IntRange(0, len(question.options))

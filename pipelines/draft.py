@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from itertools import islice
 from pathlib import Path
 
@@ -172,15 +173,52 @@ def draft(
     logs = [each for each in found if isinstance(each, FoundLog)]
     flight = match(candidates, logs, _MotionComparison(), _distance_m, ask)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
-    problem = _write(target, manifest.text)
+    text = manifest.text
+    if [target.parent.absolute()] == [_absolute(path) for path in paths]:
+        text += f"{_DRAFT}{_digest(text)} of {_digest(_listing(target.parent))}\n"
+    problem = _write(target, text)
     return Drafted(
         path=target,
-        text=manifest.text,
+        text=text,
         cameras=[camera.name for camera in flight.cameras],
         missing=manifest.missing or ([problem] if problem else []),
         assumed=manifest.assumed,
         left_out=search.left_out,
     )
+
+
+_DRAFT = "# `mocap run` drafts it again when files are added, until you edit it: "
+
+
+def must_be_drafted(manifest: Path) -> bool:
+    """Test if there is no manifest, or a draft of its folder that nobody edited and that can be better now.
+
+    Something is missing in such a draft, or the folder has other files than when it was drafted.
+    """
+    try:
+        text, mark, digests = manifest.read_text(encoding="utf-8", errors="replace").rpartition(_DRAFT)
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError as error:
+        raise as_data_error(error, manifest) from error
+    edited, _, files = digests.partition(" of ")
+    if not mark or edited != _digest(text):
+        return False
+    return "missing: " in text or files.strip() != _digest(_listing(manifest.parent))
+
+
+def _digest(text: str) -> str:
+    return sha256(text.encode(errors="replace")).hexdigest()[:12]
+
+
+def _listing(home: Path) -> str:
+    """List the files in a folder with their sizes, without hidden ones, sessions and its flight.yaml."""
+    files: list[str] = []
+    for folder, inner, names in os.walk(home):
+        inner[:] = sorted(name for name in inner if name[0] != "." and not name.endswith(".session"))
+        shown = [Path(folder, name).relative_to(home) for name in sorted(names) if name[0] != "."]
+        files += [f"{name} {(home / name).lstat().st_size}" for name in shown if str(name) != "flight.yaml"]
+    return "\n".join(files)
 
 
 def _absolute(path: Path) -> Path:

@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.draft import draft
+from pipelines.draft import draft, must_be_drafted
 from pipelines.drafting.manifest_text import one_line
-from pipelines.drafting.matching import Ask
+from pipelines.drafting.matching import Answer, Ask, Question
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Reconstructed, reconstruct
 from pipelines.replan import replan
 from pipelines.report import report
+from pipelines.session.description import assumptions_as_warnings
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 
@@ -21,11 +22,11 @@ class Ran:
     """The results of all stages of a flight."""
 
     manifest: Path
-    assumed: list[str]  # what the manifest assumes, if it was drafted now
+    assumed: list[str]  # what the manifest assumes; its keys alone if it was not drafted now
     session: Path
     reconstructed: Reconstructed
     page: Path
-    warnings: list[str]
+    warnings: list[str]  # without a line for what is assumed
 
 
 def run(
@@ -48,22 +49,34 @@ def run(
         except DataError as error:
             progress.note(f"planners were not compared: {error}")
     page = report(session).place
-    warnings = list(dict.fromkeys([*description.warnings, *reconstructed.record.warnings]))
-    return Ran(manifest, assumed, session, reconstructed, page, warnings)
+    said = [*description.warnings, *reconstructed.record.warnings]
+    warnings = [
+        each for each in dict.fromkeys(said) if each not in assumptions_as_warnings(description.assumptions)
+    ]
+    return Ran(manifest, assumed or description.assumptions, session, reconstructed, page, warnings)
 
 
 def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[str]]:
-    """Return the manifest of a folder, drafted if there is none, and what it assumes if it was drafted.
+    """Return the manifest of a folder, and what it assumes if it was drafted now (see `must_be_drafted`).
 
     DataError: the folder holds no flight, or something is missing that only the user knows.
     """
     manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
-    if manifest.exists():
+    if not must_be_drafted(manifest):
         return manifest, []
-    found = draft([folder], manifest, ask=ask, progress=progress)
+    asked: list[Question] = []
+
+    def note_and_ask(question: Question) -> Answer | None:
+        answer = ask(question)
+        asked.extend([question] if answer is None else [])
+        return answer
+
+    place = manifest.parent if manifest.exists() else folder
+    found = draft([place], manifest, overwrite=True, ask=note_and_ask, progress=progress)
     progress.note(f"{manifest}: drafted, with {len(found.cameras)} cameras")
     if found.missing:
         problem = f"was drafted and lacks {'; '.join(map(one_line, found.missing))}"
-        remedy = "write it there, where a comment marks the place, and run the same command again"
-        raise DataError(manifest, problem, remedy, code="incomplete")
+        likely = ", or let --yes take the likely answers" if asked else ""
+        remedy = "add the file that has it, or write it where a comment marks the place, and run the same command"
+        raise DataError(manifest, problem, f"{remedy} again{likely}", code="incomplete")
     return manifest, found.assumed

@@ -342,8 +342,8 @@ class _ManifestWriter:
 
     def _intrinsics(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("intrinsics")
-        if choice is None and (guess := _lens_by_subtitles(camera)) is not None:
-            what = "the focal length of its subtitles, which its pictures refine"
+        if choice is None and (guess := _lens(camera)) is not None:
+            what = f"a focal length of {camera.focal_35_mm:g} mm on film 36 mm wide, no calibration"
             remark = self.assume(camera, "intrinsics", what)
             return DraftedKey(guess, [remark], self.others("intrinsics", self.draft.free_intrinsics))
         if choice is None:
@@ -367,7 +367,7 @@ class _ManifestWriter:
         origin = "#   origin: {latitude_deg: 0, longitude_deg: 0, altitude_m: 0}  # else the first position's"
         return DraftedKey(
             {"frame": "enu"} | ({"assumed": True} if guessed else {}),
-            ["assumed: the poses have z up (x east, y north); or ned"] if guessed else [],
+            [self.assume(None, "world", "the poses have z up (x east, y north); or ned")] if guessed else [],
             [origin] if any(c.by_gps for c in taken) else [],
         )
 
@@ -461,25 +461,15 @@ def _is_turned_by_film(camera: CameraDraft) -> bool:
     return choice is not None and choice.taken.unturned and filmed
 
 
-def _lens_by_subtitles(camera: CameraDraft) -> dict[str, object] | None:
-    """Guess the lens of a camera whose film is mapped, from the focal length in its subtitles."""
-    choice, film = camera.choices.get("pose"), camera.film
-    if choice is None or film is None or not _is_turned_by_film(camera):
-        return None
-    focal_35_mm = choice.taken.focal_35_mm if isinstance(choice.taken, FlownPoses) else None
-    if focal_35_mm is None:
+def _lens(camera: CameraDraft) -> dict[str, object] | None:
+    """Return the lens of a camera whose focal length is known without a calibration."""
+    film, focal_35_mm = camera.film, camera.focal_35_mm
+    if film is None or focal_35_mm is None:
         return None
     width, height = film.size
     focal_px = round(focal_35_mm / 36 * width, 1)
-    return {
-        "width": width,
-        "height": height,
-        "fx": focal_px,
-        "fy": focal_px,
-        "cx": (width - 1) / 2,
-        "cy": (height - 1) / 2,
-        "assumed": True,
-    }
+    size: dict[str, object] = {"width": width, "height": height, "fx": focal_px, "fy": focal_px}
+    return {**size, "cx": (width - 1) / 2, "cy": (height - 1) / 2, "assumed": True}
 
 
 def _settings(candidate: Proposal) -> dict[str, object]:

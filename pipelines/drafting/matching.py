@@ -8,7 +8,7 @@ are listed as alternatives.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, get_args
 
@@ -51,6 +51,14 @@ SAME_DRONE_M = 30.0
 # Subtitles may lack this share of the frames of their own video.
 MAX_MISSING_SUBTITLES = 0.1
 
+LENSES_35_MM = {
+    24: "drones since 2018",
+    28: "Mavic Pro, Mavic 2 Pro, older drones",
+    35: "longer lenses",
+    18: "action cameras",
+}
+"""Focal lengths of usual cameras, as on film 36 mm wide; the first is the likeliest."""
+
 MAP_TYPES = ("Octomap", "GridMap", "OccupancyGrid")
 """Types of whole maps, the preferred first; clouds of points are seldom in the frame of the poses."""
 
@@ -73,9 +81,9 @@ Distance = Callable[[FlownPoses, FlownPoses], float | None]
 
 @dataclass(frozen=True)
 class Question:
-    """Question to the user about a key of a camera, with its possible values, the likeliest first."""
+    """Question to the user about a key of cameras, with its possible values, the likeliest first."""
 
-    camera: str
+    cameras: tuple[str, ...]
     key: str
     options: tuple[str, ...]
 
@@ -112,6 +120,7 @@ class CameraDraft:
     paired: bool = False  # video and keypoints are matched only because nothing else is left
     choices: dict[str, Chosen] = field(default_factory=dict)
     gimbal_reference: RelativeTo | None = None  # what its gimbal's angles are relative to, by its pictures
+    focal_35_mm: float | None = None  # as on film 36 mm wide, where no calibration has it
     true_poses: Chosen | None = None
 
     @property
@@ -196,6 +205,7 @@ def match(
     _prefer_attitudes(cameras, moving, distance)
     for camera in cameras:
         _ask_for_the_rest(camera, cameras, moving, of.get("intrinsics", []), ask)
+    _find_lenses([c for c in cameras if c.film is not None and "intrinsics" not in c.choices], of, ask)
     if any("pose" in c.choices and c.choices["pose"].taken.by_gps for c in cameras):
         actors += [c for c in of.get("fixes", []) if is_called(f"{c.topic} {c.place[-1]}", ACTOR)]
     maps = _maps(of.get("map", []), cameras)
@@ -403,15 +413,30 @@ def _ask_for_the_rest(
         if key in camera.choices or not listed:
             continue
         options = tuple(f"{' '.join(filter(None, (c.path.name, c.topic)))} ({c.about})" for c in listed)
-        if (answer := ask(Question(camera.name, key, options))) is not None:
+        if (answer := ask(Question((camera.name,), key, options))) is not None:
             others = tuple(c for k, c in enumerate(listed) if k != answer.option)
             why = "for nothing else is as likely"
             camera.choices[key] = Chosen(listed[answer.option], others, answer.stated, why)
     if "gimbal" in camera.choices and camera.gimbal_reference is None:
         references: tuple[RelativeTo, ...] = get_args(RelativeTo)
         options = tuple(f"angles relative to the {each}" for each in references)
-        if (answer := ask(Question(camera.name, "gimbal", options))) is not None:
+        if (answer := ask(Question((camera.name,), "gimbal", options))) is not None:
             camera.gimbal_reference = references[answer.option]
+
+
+def _find_lenses(cameras: Sequence[CameraDraft], of: Mapping[str, Sequence[Proposal]], ask: Ask) -> None:
+    """Find focal lengths of cameras without a calibration: by their subtitles, else one for all by asking."""
+    stated = {c.labels: c.focal_35_mm for c in of.get("pose", []) if isinstance(c, FlownPoses)}
+    for camera in cameras:
+        if camera.film is not None:
+            camera.focal_35_mm = stated.get(camera.film.labels)
+    unknown = [camera for camera in cameras if camera.focal_35_mm is None]
+    if not unknown or of.get("intrinsics"):
+        return
+    options = tuple(f"{focal} mm on film 36 mm wide ({who})" for focal, who in LENSES_35_MM.items())
+    if (answer := ask(Question(tuple(c.name for c in unknown), "intrinsics", options))) is not None:
+        for camera in unknown:
+            camera.focal_35_mm = list(LENSES_35_MM)[answer.option]
 
 
 def _beside_pose(pose: Proposal, candidates: Sequence[Proposal]) -> list[Proposal]:

@@ -246,7 +246,14 @@ def _determines_focal(model: Any) -> bool:
     camera = next(iter(other.cameras.values()))
     focal_px = float(camera.params[0])
     camera.params = [focal_px * OTHER_FOCAL, *camera.params[1:]]
-    pycolmap.bundle_adjustment(other, pycolmap.BundleAdjustmentOptions(refine_extra_params=False))
+    options = pycolmap.BundleAdjustmentOptions(refine_extra_params=False, print_summary=False)
+    options.ceres.solver_options.num_threads = 1
+    adjusted = pycolmap.BundleAdjustmentConfig()
+    for number in other.images:
+        adjusted.add_image(number)
+    adjusted.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # `pycolmap.bundle_adjustment` prints to stderr whatever its logging is set to.
+    pycolmap.create_default_bundle_adjuster(options, adjusted, other).solve()
     found_px = float(next(iter(other.cameras.values())).params[0])
     return abs(found_px / focal_px - 1) < MAX_FOCAL_DISAGREEMENT
 

@@ -104,11 +104,11 @@ def test_recorders_names_leave_the_choice_between_topics_and_no_calibration(tmp_
 
     def ask(question: Question) -> Answer:
         asked.append(question)
-        second_lens = question.camera == "DJI_0008" and question.key == "intrinsics"
+        second_lens = question.cameras == ("DJI_0008",) and question.key == "intrinsics"
         return Answer(int(second_lens), stated=question.key == "intrinsics")
 
     result = draft([tmp_path], overwrite=True, ask=ask)
-    assert [(each.camera, each.key) for each in asked] == [
+    assert [(*each.cameras, each.key) for each in asked] == [
         (camera, key) for camera in ("DJI_0007", "DJI_0008") for key in ("pose", "intrinsics")
     ]
     assert [len(each.options) for each in asked] == [2, 2, 1, 2]  # one topic is taken
