@@ -77,6 +77,8 @@ def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[s
     if found.missing:
         problem = f"was drafted and lacks {'; '.join(map(one_line, found.missing))}"
         likely = ", or let --yes take the likely answers" if asked else ""
-        remedy = "add the file that has it, or write it where a comment marks the place, and run the same command"
+        remedy = (
+            "add the file that has it, or write it where a comment marks the place, and run the same command"
+        )
         raise DataError(manifest, problem, f"{remedy} again{likely}", code="incomplete")
     return manifest, found.assumed
