@@ -110,7 +110,6 @@ def export_command(
 
 
 def _print(what: str, paths: Sequence[Path]) -> None:
-    """Print a line for each of a few files; of many, print the first ones and the number of the rest."""
     shown = paths if len(paths) <= _LONGEST_LIST else paths[: _LONGEST_LIST - 1]
     for path in shown:
         say(f"{what}: {path}")

@@ -87,7 +87,6 @@ def ingest_command(
 
 
 def _print_stamps(result: Ingested) -> None:
-    """Print which stamps of the logs were used, because recorders differ in which are right."""
     for stamps in ("header", "receive"):
         names = [name for name, c in result.description.cameras.items() if c.poses.stamps == stamps]
         if names:
@@ -95,7 +94,6 @@ def _print_stamps(result: Ingested) -> None:
 
 
 def _print_origin(result: Ingested) -> None:
-    """Print the place on Earth of the world's origin."""
     if origin := result.description.origin:
         say(
             f"world origin: {origin.latitude_deg:.7f}, {origin.longitude_deg:.7f}, {origin.altitude_m:.2f} m"

@@ -73,7 +73,6 @@ def init_command(
 
 
 def _write_example(name: str, output: Path | None, overwrite: bool, shown: Shown) -> None:
-    """Write the files of an example flight: simulated logs, keypoints, calibrations, map and truth."""
     from pipelines.simulate import example_scenario, simulate
 
     if output is not None:
@@ -96,7 +95,6 @@ def _from_here(path: Path) -> Path:
 
 
 def _left_out(left_out: Mapping[Path, str]) -> Iterator[str]:
-    """Yield a line for each file, or one line for many files of one kind in a folder."""
     alike: dict[tuple[Path, str, str], list[Path]] = defaultdict(list)
     for path, reason in left_out.items():
         alike[path.parent, path.suffix, reason].append(path)

@@ -29,7 +29,6 @@ def models_command(context: click.Context, as_json: bool) -> None:
 
 
 def _list(as_json: bool) -> None:
-    """Print the registered detectors with their files, and the families for users' own models."""
     from pipelines.session.registries import DETECTORS, DetectorFamily
 
     registered = DETECTORS.all()

@@ -229,7 +229,6 @@ _ERRORS = {
 
 
 def _print_summary(metrics: dict[str, Any]) -> None:
-    """Print the main figures: errors against the truth if there is one, and figures without truth."""
     reprojection, shape = metrics["reprojection_px"], metrics["shape"]
     shown = {"reconstructed_share": ("reconstructed %", 100)}
     if metrics["mpjpe_mm"] is not None:

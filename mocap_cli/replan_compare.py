@@ -193,7 +193,6 @@ def _with_interval(stated: dict[str, Any], scale: float) -> str | None:
 
 
 def _print_filmed(metrics: dict[str, Any]) -> None:
-    """Print a table with one row for each arm, and below it one for each of several people."""
     say()
     say(f"filmed (simulated) at {metrics['rate_hz']:g} Hz, keypoints by {metrics['detector']}:")
     _print_rows(

@@ -160,7 +160,6 @@ def run_flight(job: Job) -> Outcome:
 
 
 def _run_stages(job: Job) -> Outcome:
-    """Run all stages of one flight."""
     failed: dict[str, str] = {}  # the first error, by its stage
     finished: list[str] = []
     unchanged = True
@@ -196,7 +195,6 @@ def _is_ingested(job: Job, failed: Mapping[str, str]) -> bool:
 
 
 def _run(stage: str, job: Job) -> bool:
-    """Run a stage; return True if there was nothing to do."""
     match stage:
         case "ingest":
             make_folder(job.session.parent)
@@ -255,9 +253,6 @@ def _summed_up(session: Path, stages: Sequence[str]) -> Outcome:
     )
 
 
-# --- on Dask -------------------------------------------------------------------------------------------
-
-
 def _outcomes(
     jobs: Sequence[Job], workers: int, scheduler: str | None, progress: Progress
 ) -> Iterator[tuple[int, Outcome]]:
@@ -278,9 +273,6 @@ def _outcomes(
             yield number, outcome
 
 
-# --- the summary ---------------------------------------------------------------------------------------
-
-
 def _absolute(path: Path) -> Path:
     if url_of(path):
         return path
@@ -288,7 +280,6 @@ def _absolute(path: Path) -> Path:
 
 
 def _sessions(flights: Sequence[Path], output: Path | None) -> list[Path]:
-    """List the folders of the flights' sessions."""
     if output is None:
         return [flight.with_suffix(".session") for flight in flights]
     return [output / f"{name}.session" for name in names_of(flights)]
@@ -315,7 +306,6 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
 
 
 def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
-    """Make a row of the summary, with paths relative to the summary's folder."""
     page = job.session / "report" / "index.html"
     report = _from(folder, page) if outcome.reported else None
     return FlightRow(

@@ -132,7 +132,6 @@ def _doubts(
     detected: StageRecord | None,
     pose_noise: str | None,
 ) -> list[Doubt]:
-    """Doubt what cannot be right."""
     folder = session.folder
     cameras, _ = load_cameras(
         folder,
@@ -154,7 +153,6 @@ def _doubts(
 
 
 def _followed(session: Session, cameras: Sequence[Camera]) -> dict[str, Followed]:
-    """Load the backgrounds that the session has."""
     if session.intact_record(BACKGROUND.name) is None:
         return {}
     found = {camera.name: load_tracks(session.folder, camera) for camera in cameras if not camera.static}

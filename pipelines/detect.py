@@ -251,7 +251,6 @@ def _looked_at(work: _Work, detector: Detector, media: Mapping[str, MediaEntry])
 
 
 def _times(ingested: StageRecord, media: Mapping[str, MediaEntry]) -> dict[str, str]:
-    """Return the hashes of the tables that hold the frames' times."""
     tables = [f"cameras/{name}/frames.parquet" for name in media]
     return {name: ingested.outputs[name] for name in tables}
 
@@ -446,7 +445,6 @@ def _produce(
     block: Block,
     folder: Path,
 ) -> None:
-    """Write what the detector finds in the pictures of one block."""
     networks = _networks(detector)
     frame, t_ns = work.frames(block)
     tracker = PeopleTracker(networks, only_one=only_one)
@@ -501,7 +499,6 @@ def _table(
 def _assemble(
     folder: Path, media: Mapping[str, MediaEntry], blocks: list[Block], folders: list[Path]
 ) -> dict[str, dict[str, int]]:
-    """Join the tables of the blocks to one for each camera, and return the summed counts."""
     import pandas as pd
 
     counts: dict[str, dict[str, int]] = {}
@@ -639,7 +636,6 @@ def _blocks_to_follow(
     every: int,
     span_s: tuple[float | None, float | None],
 ) -> list[FollowedBlock]:
-    """List the blocks of a camera's pictures that are followed."""
     frames = read_table(folder / "cameras" / camera / "frames.parquet", FRAMES)
     numbers, t_ns = (frames[name].to_numpy(np.int64) for name in ("frame", "t_ns"))
     span, step = range(len(numbers)), 1
@@ -665,7 +661,6 @@ def _blocks_to_follow(
 
 
 def _assemble_background(folder: Path, parts: Iterable[Path]) -> dict[str, int]:
-    """Join the parts of a camera; return their counts."""
     total = {"pictures": 0, "undecoded": 0, "points": 0, "stills": 0}
     (folder / "stills").mkdir(parents=True)
 

@@ -277,7 +277,6 @@ class _FileSearch:
         return sorted(things, key=lambda thing: thing[0]), Path(os.path.commonpath(bases))
 
     def _under(self, path: Path) -> Iterator[Thing]:
-        """Yield the things at a path and below it."""
         if path.resolve() in self._seen:  # named twice, or a link that leads back
             return
         self._seen.add(path.resolve())
@@ -380,7 +379,6 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Propo
 def _described(
     path: Path, place: NamePlace, format_: Format, ambiguous: bool
 ) -> Iterator[Proposal | FoundLog]:
-    """Describe a thing by the kind of its format."""
     file: dict[str, object] = {"file": path}
     head, labels, title = (path, place), (label_of_place(place),), format_.title
     if isinstance(format_, KeypointFormat):
@@ -434,7 +432,6 @@ def _described(
 
 
 def _of_calibration(path: Path, place: NamePlace, format_: CalibrationFormat) -> Iterator[Proposal]:
-    """Yield the intrinsics and the pose of every camera."""
     cameras, label = format_.read_calibration(path), label_of_place(place)
     if len(cameras) > MAX_CAMERAS_OF_CALIBRATION:
         return
@@ -619,7 +616,6 @@ def _poses_in(found: Proposal) -> tuple[Int64, Float, Float] | None:
 
 
 def _enu(geodetic: Float, place: Place) -> Float:
-    """Convert latitudes, longitudes and heights [N, 3] to metres east, north and up of a place."""
     return enu_from_geodetic(geodetic[:, 0], geodetic[:, 1], geodetic[:, 2], place)
 
 
@@ -639,7 +635,6 @@ def _distance_m(log: FlownPoses, other: FlownPoses) -> float | None:
 
 
 def _recording(path: Path, place: NamePlace, format_: LogFormat) -> FoundLog:
-    """Describe the topics of a log, with the frames of its poses and transforms."""
     kinds: dict[str, SourceKind] = {"poses": "pose", "pictures": "video", "angles": "gimbal"}
     kinds |= {"intrinsics": "intrinsics", "transforms": "transforms"}
     topics: dict[str, Proposal] = {}

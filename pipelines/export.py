@@ -214,13 +214,11 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
 def _reconstructed(
     folder: Path, record: StageRecord | None, name: str, schema: pa.Schema
 ) -> pd.DataFrame | None:
-    """Return a table of the reconstruction; None if there is none."""
     place = f"reconstruct/{name}.parquet"
     return None if record is None or place not in record.outputs else read_table(folder / place, schema)
 
 
 def _bodies(folder: Path, record: StageRecord | None) -> list[MovingBody]:
-    """Return the bodies of the reconstruction, if it has any."""
     if record is None or "reconstruct/body.parquet" not in record.outputs:
         return []
     place = folder / "reconstruct"
@@ -236,7 +234,6 @@ def _doubts(folder: Path, description: Description, record: StageRecord | None) 
 
 
 def _planned(folder: Path, record: StageRecord | None) -> list[PlannedArm]:
-    """Return the planners' arms of the last comparison."""
     if record is None:
         return []
     actor = read_table(folder / "replan" / "actor.parquet", ACTOR)

@@ -197,9 +197,6 @@ def film(
     return FilmResult(folder, record, figures, skipped=False)
 
 
-# --- what is filmed ------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Arm:
     """The N cameras of an arm at the T moments of its pictures, and the people that they film."""
@@ -298,9 +295,6 @@ def _rows(t_ns: Int64, settings: FilmSettings) -> Int64:
     )
 
 
-# --- pictures ------------------------------------------------------------------------------------------
-
-
 def _film_camera(
     arm: _Arm, camera: int, renderer: Renderer, detector: Detector, progress: Progress, folder: Path
 ) -> None:
@@ -353,7 +347,6 @@ def _whose(
 
 
 def _read_sightings(parts: Sequence[Path]) -> list[SimulatedKeypoints]:
-    """Read what all cameras found of each person."""
     xy, confidence = [], []
     for part in parts:
         with np.load(part / "keypoints.npz") as stored:
@@ -361,9 +354,6 @@ def _read_sightings(parts: Sequence[Path]) -> list[SimulatedKeypoints]:
             confidence.append(stored["confidence"])
     found, sure = np.stack(xy), np.stack(confidence)
     return [SimulatedKeypoints(found[:, :, p], sure[:, :, p]) for p in range(found.shape[2])]
-
-
-# --- measuring -----------------------------------------------------------------------------------------
 
 
 def _measured(
@@ -408,7 +398,6 @@ def _means(each: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _write_arm(folder: Path, arm: _Arm, points: Float, parts: Sequence[Path]) -> None:
-    """Write the skeletons [T, P, J, 3] of an arm, and each camera's pictures."""
     folder.mkdir()
     motion = JointMotion(arm.t_ns, arm.people[0].person.joints, points)
     write_table(folder / "skeleton.parquet", motion_table(motion), TRUTH)

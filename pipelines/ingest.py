@@ -218,11 +218,9 @@ class _FlightReader:
         self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 
     def __enter__(self) -> Self:
-        """Return the reader itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close the logs."""
         self._logs.__exit__(*exception)
 
     def refuse_unfit(self) -> None:
@@ -260,12 +258,10 @@ class _FlightReader:
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
 
     def _pose_axes(self, camera: CameraSources) -> Axes:
-        """Return the axes that the poses of a camera or its body are in."""
         pose = camera.pose
         return pose.axes or self._logs.settings(pose.file).axes or self._flight.world.frame
 
     def _gimbal_axes(self, camera: CameraSources) -> Axes:
-        """Return the axes that the angles of a camera's gimbal are in."""
         gimbal = camera.gimbal
         if gimbal is None:
             return self._flight.world.frame
@@ -426,7 +422,6 @@ class _FlightReader:
         )
 
     def _store_true_bodies(self, folder: Path, stated: str) -> None:
-        """Write the true bodies of a simulated flight, with places in the session's world."""
         place = located(self._flight_path.parent, stated)
         bodies = read_table(place, BODY)
         centre = bodies[["x", "y", "z"]].to_numpy(np.float64)
@@ -588,7 +583,6 @@ def _store_cameras(
     check_sources: Callable[[], None],
     progress: Progress,
 ) -> tuple[dict[str, CameraEntry], list[str]]:
-    """Read the cameras that no interrupted ingest has read; return their entries, and warnings."""
     entries: dict[str, CameraEntry] = {}
     warnings: list[str] = []
     for name in names:
@@ -606,7 +600,6 @@ def _track(run: Run, name: str) -> Trajectory:
 
 
 def _store_camera(reader: _FlightReader, name: str, check_sources: Callable[[], None], folder: Path) -> None:
-    """Store one camera; raise an error if its sources were changed meanwhile."""
     reader.store_camera(name, folder)
     check_sources()
 

@@ -271,7 +271,6 @@ def _detected(
     executor: Executor | None,
     progress: Progress,
 ) -> StageRecord | None:
-    """Run the stage `detect`; return None if every camera has imported keypoints."""
     detected = detect(
         session,
         detector=settings.detector,
@@ -369,7 +368,6 @@ def _reason(error: DataError, settings: ReconstructSettings) -> str:
 
 
 def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> None:
-    """Refuse a result without any joint; the message gives the counts by status, and the likely mistake."""
     status = attempt.result.status
     if (status == STATUS.index("ok")).any():
         return
@@ -388,7 +386,6 @@ def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> 
 def _write_tables(
     folder: Path, attempt: Attempt, gait: pd.DataFrame, bodies: Sequence[BodyFit | None]
 ) -> None:
-    """Write skeleton, angles, gait, bodies if any, and the poses of cameras that are not those of the log."""
     observations, views, result = attempt.observations, attempt.views, attempt.result
     join_tables(folder / "skeleton.parquet", skeleton_parts(observations, result), SKELETON)
     join_tables(folder / "angles.parquet", angles_parts(observations, views, result), ANGLES)
@@ -413,7 +410,6 @@ def _counts(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, ob
 
 
 def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
-    """Doubt what cannot be right in what was reconstructed."""
     cameras = flight.cameras
     if attempt.clocks is not None:
         cameras = shifted(cameras, attempt.clocks.offset_s)
@@ -722,7 +718,6 @@ class _Triangulated:
 
 
 def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
-    """Observe and triangulate by the method, or by what it starts from."""
     seen = flight.waiting.put(_observe(flight, cameras))
     flight.waiting.release()
     views = views_with_noise(cameras, seen.observations, pixel_sigma=PIXEL_SIGMA_PX)
@@ -739,7 +734,6 @@ def _doubted(made: _Triangulated) -> list[str]:
 def _robust_flight(
     flight: LoadedFlight, cameras: list[Camera], made: _Triangulated, clock_sigma_s: Float
 ) -> RobustFlight:
-    """Collect what the refinement starts from."""
     seen = made.seen
     return RobustFlight(
         cameras,

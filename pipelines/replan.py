@@ -215,9 +215,6 @@ def _keep_by_name(
     return sorted(kept), lost
 
 
-# --- what is compared ----------------------------------------------------------------------------------
-
-
 def inputs_of(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
     """Load the inputs: all that was ingested, and the reconstruction if there is no truth or no actor.
 
@@ -313,9 +310,6 @@ def detect_by_model(
     return detect_keypoints(pixels, free, tilt_deg, height_px, errors, rng, joints=joints)
 
 
-# --- what is stored ------------------------------------------------------------------------------------
-
-
 def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder: Path) -> None:
     """Fly one arm and measure from its cameras; write everything that the comparison needs to the folder."""
     flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
@@ -352,7 +346,6 @@ def read_result(folder: Path) -> ArmResult:
 
 
 def _actor_table(scene: ReplayScene) -> pd.DataFrame:
-    """Make rows of `tables.ACTOR` from the actor that was used to score the arms."""
     import pandas as pd
 
     table = pd.DataFrame({"t_ns": scene.t_ns, "person": 0})

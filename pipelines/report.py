@@ -389,14 +389,12 @@ class _Shown:
 
 
 def _rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.DataFrame:
-    """Read rows of a long table, see `read_rows`, and give back the memory of the others."""
     table = read_rows(path, schema, name, chosen)
     return_unused()
     return table
 
 
 def _times(folder: Path, description: Description, *, reconstructed: bool) -> Int64:
-    """Return the times of the skeleton, or those of the camera with the most pictures."""
     if reconstructed:
         return distinct(folder / "reconstruct" / "skeleton.parquet", "t_ns")
     camera = max(description.cameras, key=lambda name: description.cameras[name].frames.count)

@@ -202,11 +202,7 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
     return start
 
 
-# --- logs and map ------------------------------------------------------------------------------------
-
-
 def _write_grid(path: Path, occupancy: Occupancy) -> None:
-    """Write the map in the npz layout that `map:` reads."""
     np.savez_compressed(
         path,
         probability=occupancy.probability,
@@ -222,9 +218,6 @@ def _write_log(path: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> No
             log.write(message.topic, message.type, message.received_ns, message.fields)
 
 
-# --- pictures ------------------------------------------------------------------------------------------
-
-
 def _film(
     flight: SimulatedFlight,
     folder: Path,
@@ -232,7 +225,6 @@ def _film(
     workers: int,
     progress: Progress,
 ) -> None:
-    """Render and encode every drone's pictures, block by block, and join the blocks."""
     surfaces, world = flight.world.surfaces(), flight.scenario.world
     halt = Halt()
     # All drones have the same lens, so they share what was prepared for it.

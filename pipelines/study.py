@@ -271,7 +271,6 @@ def _measure_condition(
     progress: Progress,
     folder: Path,
 ) -> None:
-    """Write the rows of every trial and method."""
     cameras = formation(filmed, cameras=condition.robots, tilt_deg=condition.tilt_deg)
     exact = exact_keypoints(filmed, cameras)
     models = condition.noise.models()
@@ -397,7 +396,6 @@ def _varied(stated: Stated) -> list[str]:
 
 
 def _replay_settings(stated: Stated) -> ReplanSettings:
-    """Return the settings that all replays share."""
     names = set(SETTINGS) - {"radius_m"}
     unknown = [name for name in stated if name not in {*_OF_SESSION, *names}]
     if unknown:
@@ -441,7 +439,6 @@ def _cells(varied: Stated) -> Iterator[dict[str, Any]]:
 
 
 def _planner_of(planner: PlannerConfig, cell: Mapping[str, Any]) -> PlannerConfig:
-    """Change the planner settings that a cell states."""
     changes = {
         _SETTINGS.get(name, name): value for name, value in cell.items() if name not in ("arm", "robots")
     }
@@ -462,7 +459,6 @@ def _scene_of(scene: ReplayScene, cell: Mapping[str, Any]) -> ReplayScene:
 def _figures(
     scene: ReplayScene, cell: Mapping[str, Any], scores: dict[str, Any], capped: np.ndarray[Any, Any]
 ) -> Row:
-    """Return the figures of one combination; way and energy are those of all drones together."""
     errors = scores["reconstruction_error"]
     estimate = mean_of_trials(capped)
     low, high = estimate["interval"] if estimate is not None and estimate["interval"] else (None, None)

@@ -55,9 +55,6 @@ def survey(path: Path) -> list[Survey]:
     raise DataError(path, like.problem, like.remedy or EXPECTED, code="wrong-kind")
 
 
-# --- what mocap writes ---------------------------------------------------------------------------------
-
-
 def _of_session(path: Path) -> dict[str, Any]:
     session = open_session(path)
     description = read_description(path)
@@ -145,9 +142,6 @@ def _of_study(metrics: Mapping[str, Any]) -> dict[str, Any]:
             own = errors.setdefault(f"{condition}, noise {cell['noise']}", {})
             own[cell["method"]] = None if error is None else error["mean"]
     return {"study": " ".join(metrics["command"]), "keypoints": metrics["keypoints"], "mpjpe_mm": errors}
-
-
-# --- what users write for it ---------------------------------------------------------------------------
 
 
 def _of_yaml(path: Path) -> Survey:

@@ -228,7 +228,6 @@ class TimeSpan:
         return TimeSpan(self.first_ns + by_ns, self.last_ns + by_ns)
 
     def __str__(self) -> str:
-        """Write the length and the start."""
         return f"{self.length_ns / 1e9:.6g} s from {self.first_ns / 1e9:.3f}"
 
 

@@ -209,7 +209,6 @@ class _ManifestWriter:
         return self.entry("keypoints", listed, remarks, settings)
 
     def _times(self, camera: CameraDraft) -> dict[str, DraftedKey]:
-        """Return the times of the pictures, and the clock that they are by."""
         choice, film = camera.choices.get("frame_times"), camera.film
         clock = DraftedKey(None, ["if its clock is off, or unsure"], example={"offset_s": 0, "sigma_s": 0.2})
         if choice:
@@ -299,7 +298,6 @@ class _ManifestWriter:
         return self.entry("pose", [taken, *choice.others], remarks)
 
     def _mount(self, camera: CameraDraft) -> dict[str, DraftedKey]:
-        """Return the mount or the gimbal of a camera whose poses are not its own."""
         choice, gimbal = camera.choices.get("pose"), camera.choices.get("gimbal")
         if choice is None or choice.taken.kind == "still":
             return {}
@@ -473,7 +471,6 @@ def _lens(camera: CameraDraft) -> dict[str, object] | None:
 
 
 def _settings(candidate: Proposal) -> dict[str, object]:
-    """Return what a candidate states, with the thing that its logged poses are of."""
     logged = candidate.kind == "pose" and ("topic" in candidate.settings or "parent" in candidate.settings)
     return {**candidate.settings, **({"of": "body" if candidate.of_body else "camera"} if logged else {})}
 
@@ -536,7 +533,6 @@ def write_manifest(draft: FlightDraft, name: str, relative: Callable[[Path], str
 
 
 def _in_short(remarks: Mapping[str, list[str]]) -> list[str]:
-    """Write one line for each remark, with the cameras that it concerns."""
     lines = []
     for what, names in remarks.items():
         shown = ", ".join(names[:MAX_LISTED]) + (", ..." if len(names) > MAX_LISTED else "")

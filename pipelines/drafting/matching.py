@@ -269,7 +269,6 @@ def _maps(maps: Sequence[Proposal], cameras: Sequence[CameraDraft]) -> list[Prop
 
 
 def _cameras(of: dict[str, list[Proposal]], moving: Sequence[Proposal]) -> list[CameraDraft]:
-    """Make a camera for everything that has pictures; if nothing has, one for each source of poses."""
     cameras: list[CameraDraft] = []
     videos = of.get("video", [])
     coloured = [c for c in videos if not (c.topic and is_called(c.topic, NO_PICTURES))]
@@ -594,7 +593,6 @@ class _Chooser:
 
 
 def _shared(spans: Iterable[TimeSpan | None], anchors: Iterable[TimeSpan]) -> float:
-    """Sum the overlaps of spans with other spans, ns."""
     return float(sum(max(span.overlap_ns(anchor), 0) for anchor in anchors for span in spans if span))
 
 
@@ -603,7 +601,6 @@ def _spans(candidates: Iterable[Proposal]) -> list[TimeSpan]:
 
 
 def _beside(first: Chosen | None, second: Chosen | None) -> Chosen | None:
-    """Return the first choice with the candidates of the second as alternatives."""
     if first is None or second is None:
         return first or second
     return Chosen(first.taken, (*first.others, second.taken, *second.others), first.named)

@@ -112,9 +112,6 @@ def fit_to_size(
     raise ValueError(f"{sizes}: another shape, and more than 2 % off")
 
 
-# --- distortion models, on normalised coordinates [..., 2] ---------------------------------------------
-
-
 def _distort_none(normalised: Float, _: tuple[float, ...]) -> Float:
     return normalised
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64
 
-# --- tuning ---
-
 # The slopes are those of all pairs of events, and so many events have 80,000 pairs.
 _MAX_EVENTS = 400
 # A drift is significant from this many standard deviations on.
@@ -76,8 +74,6 @@ def _median_slope(t_s: Float, lead_s: Float) -> float:
     return float(np.median(rise[far] / step[far])) if far.any() else 0.0
 
 
-# --- steps of a clock -----------------------------------------------------------------------------------
-
 # The stamp of a header minus that of receipt is minus the delay of the transport, plus the offset of the two
 # clocks. A clock that is set changes it between two messages, for good, and by as much as the header's own
 # interval is too long or too short. Delays change it, too, but leave the header's interval as it is.
@@ -112,7 +108,6 @@ class ClockStep:
     is_clear: bool  # False if a queue that was emptied, its messages lost, would look the same
 
     def __str__(self) -> str:
-        """Return one line, without the topic."""
         told = (
             f"the clock of the header stamps steps by {self.step_s:+.3f} s at {self.after_s:.2f} s"
             f" (message {self.index}) against those of receipt"

@@ -134,7 +134,6 @@ def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
 
 
 def _content(name: str) -> bytes:
-    """Hash a source file."""
     state = Path(name).stat()
     return _content_of(name, state.st_mtime_ns, state.st_size)
 

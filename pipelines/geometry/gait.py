@@ -106,7 +106,6 @@ def _points(joints: Sequence[str], position: Float, name: str) -> Float:
 
 
 def _runs(t_ns: Int64, known: Bool, step_ns: float) -> list[slice]:
-    """List the runs of known frames without pauses that are long enough."""
     begins = known & np.concatenate([[True], ~known[:-1] | (np.diff(t_ns) > _MAX_GAP_STEPS * step_ns)])
     starts = np.flatnonzero(begins)
     runs = []

@@ -153,9 +153,6 @@ def _sigma(group: _Group, points: Float, found: Float, covariance: Float) -> Flo
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-# --- the groups: angles that rest on the same joints ----------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Group:
     angles: tuple[str, ...]  # A of them
@@ -301,9 +298,6 @@ def _elbow(points: Float) -> Float:
 
 def _never(points: Float) -> Float:
     return np.full((1, points.shape[-1]), np.nan)
-
-
-# --- vectors [3, N] -------------------------------------------------------------------------------------
 
 
 def _dot(one: Float, other: Float) -> Float:

@@ -27,8 +27,6 @@ FLU_FROM_FRD = np.array([1.0, 0.0, 0.0, 0.0])
 _AZIMUTH_DEG = {"forward": 0.0, "left": 90.0, "backward": 180.0, "right": -90.0, "down": 0.0, "up": 0.0}
 _STRAIGHT_DEG = {"down": 90.0, "up": -90.0}
 
-# --- fixed mounts --------------------------------------------------------------------------------------
-
 
 def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
     """Compute the rotation [4] of a camera that looks in a direction of the body, tilted down by an angle.
@@ -46,9 +44,6 @@ def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
     # About the left axis a positive angle turns forward to down.
     tilt = _turn("y", np.radians(_STRAIGHT_DEG.get(looks, down_deg)))
     return multiply(multiply(azimuth, tilt), _FLU_FROM_OPTICAL)
-
-
-# --- gimbals -------------------------------------------------------------------------------------------
 
 
 def attitude_from_angles(

@@ -80,7 +80,6 @@ class Views:
     pose_sigma: Float  # [F, C, 2] per axis: centre in m, rotation in rad; 0 where exact
 
     def __post_init__(self) -> None:
-        """Check the shapes against each other and that every pose row exists."""
         n, cameras = self.weight.shape
         instants = self.position.shape[0]
         expected = {
@@ -470,7 +469,6 @@ def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) ->
 
 
 def _rows(views: Views, rows: slice | Int64) -> Views:
-    """Take some joint-frames."""
     return replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
 
 

@@ -266,7 +266,6 @@ class Session:
         return record
 
     def _changed(self, record: StageRecord) -> Iterator[Path]:
-        """Yield the files that are not as the stage wrote them."""
         for name, expected in record.outputs.items():
             path = self.folder / name
             if not path.is_file() or sha256_of(path) != expected:

@@ -504,8 +504,6 @@ def _put_back(work: Path, target: Path) -> None:
     remove_tree(old)
 
 
-# --- errors that readers share -------------------------------------------------------------------------
-
 AGAIN = "copy it again, or export it again"
 
 

@@ -155,7 +155,6 @@ def join_tables(path: Path, parts: Iterable[pd.DataFrame], schema: pa.Schema) ->
 
 @contextmanager
 def _opened(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file; DataError if it is damaged."""
     import pyarrow.parquet as pq
 
     refuse_special(path)
@@ -247,7 +246,6 @@ def _parts(path: Path, schema: pa.Schema) -> Iterator[pd.DataFrame]:
 
 
 def _frame_of(path: Path, table: pa.Table, schema: pa.Schema) -> pd.DataFrame:
-    """Check the columns of a table that was read."""
     missing = [name for name in schema.names if name not in table.column_names]
     if missing:
         problem = f"lacks the columns {', '.join(missing)}"
@@ -457,7 +455,6 @@ def _unknown_motion(t_ns: Int64, joints: tuple[str, ...], people: int, table: pd
 
 
 def _fill_motion(motion: JointMotion, table: pd.DataFrame) -> None:
-    """Write the rows of a table into a motion that has their times."""
     joint = _index_of(table["joint"], motion.joints)
     row = np.searchsorted(motion.t_ns, table["t_ns"].to_numpy(np.int64))
     table, row, joint = table[joint >= 0], row[joint >= 0], joint[joint >= 0]

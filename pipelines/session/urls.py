@@ -198,9 +198,6 @@ def _refuse_full_disk(folder: Path, size: int, url: str) -> None:
         raise DataError(url, problem, remedy, code="disk-full")
 
 
-# --- sessions ------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
     """Yield the folder of a session; one at a URL is copied here, and uploaded whole if it changed.
@@ -245,7 +242,6 @@ def holds_session(url: str) -> bool:
 
 
 def _session_at(url: str) -> dict[str, tuple[str, int]]:
-    """List the files of a session in a store; none if there is no session."""
     try:
         files, _ = _asked(url, _files_at, missing=FileNotFoundError)
     except FileNotFoundError:
@@ -254,14 +250,12 @@ def _session_at(url: str) -> dict[str, tuple[str, int]]:
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """Compute the SHA-256 of every file that belongs to a session, by name."""
     tops = [top for top in folder.glob("[!.]*") if not top.name.endswith(".new")]
     paths = [path for top in tops for path in ([top] if top.is_file() else top.rglob("*")) if path.is_file()]
     return {path.relative_to(folder).as_posix(): sha256_of(path) for path in sorted(paths)}
 
 
 def _replace(store: Any, path: str, folder: Path, names: list[str]) -> None:
-    """Replace what lies at a path of a store by files of a folder."""
     if store.exists(path):
         store.rm(path, recursive=True)
     store.put([str(folder / name) for name in names], [f"{path}/{name}" for name in names])
@@ -294,9 +288,6 @@ def matching(pattern: str) -> list[str]:
     return _asked(pattern, lambda store, path: sorted(map(store.unstrip_protocol, store.glob(path))))
 
 
-# --- stores --------------------------------------------------------------------------------------------
-
-
 def _cache() -> Path:
     cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(cache).expanduser().absolute() / "mocap" / "stores"
@@ -307,7 +298,6 @@ def _short(url: str) -> str:
 
 
 def _opened(url: str) -> tuple[Any, str]:
-    """Open the store of a URL; return it and the path inside it."""
     url_to_fs = need("fsspec.core", "s3").url_to_fs
     scheme = url.partition(":")[0]
     options: dict[str, Any] = {"use_listings_cache": False}

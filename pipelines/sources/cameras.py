@@ -59,8 +59,6 @@ class FlightCameras:
         self._triggers = triggers
         self._note = note
 
-    # --- frame times -----------------------------------------------------------------------------------
-
     def frames(
         self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> CameraFrames:
@@ -202,8 +200,6 @@ class FlightCameras:
             stamps=self._logs.settings(video.file).stamps if is_log else "header",
         )
 
-    # --- intrinsics ------------------------------------------------------------------------------------
-
     def intrinsics(
         self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> Intrinsics:
@@ -264,7 +260,6 @@ class FlightCameras:
 
 
 def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames | None:
-    """Return the pictures of a video or a topic, by their own stamps; None if there are none."""
     if video is not None:
         return CameraFrames(np.arange(video.count), video.pts_ns, video.pts_ns, dropped=video.dropped)
     if logged is not None:

@@ -11,8 +11,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
 from pipelines.sources.parts import CameraFrames
 
-# --- tuning ---
-
 # A share of a picture's sides. Detectors search the box of a person; most of them pad it to 1.25 of its size.
 # If the box is as large as the picture, it then reaches an eighth beyond it: no detector looked further.
 _MAX_EXTRAPOLATION = 1 / 8

@@ -159,11 +159,9 @@ class FlightLogs:
         self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the most recently used one is last
 
     def __enter__(self) -> Self:
-        """Return the logs themselves."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close the files."""
         for paths in list(self._kept):
             self._close(paths)
 

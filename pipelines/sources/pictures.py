@@ -108,11 +108,9 @@ class LoggedPictures:
             unless_known.pop_all()
 
     def __enter__(self) -> Self:
-        """Return the pictures themselves."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close the files."""
         self._stack.close()
 
     def read(self, number: int) -> Picture | None:

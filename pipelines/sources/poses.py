@@ -495,7 +495,6 @@ class FlightPoses:
         return self._of_log(log, self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns))
 
     def _of_log(self, log: str, trajectory: Trajectory) -> Trajectory:
-        """Return a trajectory of a log in the world."""
         settings = self._logs.settings(log)
         turned = in_world(self._enu(trajectory, settings.axes), settings.world_from_source)
         return self._local(self._logs.paths(log)[0], turned)

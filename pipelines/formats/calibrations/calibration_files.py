@@ -505,7 +505,6 @@ def _camera_of_table(path: Path, name: str, table: dict[str, object]) -> Calibra
 
 
 def _finite(path: Path, camera: str, table: dict[str, object], key: str) -> Float:
-    """Return a value of the table as an array of finite numbers."""
     try:
         values = np.array(table.get(key), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -101,7 +101,6 @@ def parse_table(
 def _parse_csv(
     body: str, delimiter: str, columns: int, text: dict[str, int], numbers: dict[str, int]
 ) -> pa.Table:
-    """Parse rows into an Arrow table whose columns are named by their index."""
     import pyarrow as pa
     import pyarrow.csv
 
@@ -320,7 +319,6 @@ def stamp_column(header: Sequence[str]) -> tuple[int, int] | None:
 
 
 def _whole_stamp(header: Sequence[str]) -> tuple[int, int] | None:
-    """Find the time in one column, and its unit."""
     if header and header[0].strip() == "%time":
         return next(
             (k for k, cell in enumerate(header) if cell.strip() == "field.header.stamp"), 0

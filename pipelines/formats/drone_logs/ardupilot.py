@@ -177,9 +177,6 @@ class ArduPilotFormat(DroneLog):
         )
 
 
-# --- content of a log ----------------------------------------------------------------------------------
-
-
 def _position(
     log: _DataFlash, choice: TelemetryChoice, dropped: MutableMapping[str, int], notes: list[str]
 ) -> PositionTrack:
@@ -275,9 +272,6 @@ def _leap_ns(gps_ns: Int64) -> Int64:
     for since_s, seconds in reversed(_LEAP_SECONDS):
         ahead[gps_ns >= (since_s + seconds) * 1_000_000_000] = seconds
     return ahead * 1_000_000_000
-
-
-# --- reading -------------------------------------------------------------------------------------------
 
 
 class _DataFlash:

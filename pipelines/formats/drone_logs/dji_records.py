@@ -101,9 +101,6 @@ class DjiRecordFormat(DroneLog):
         return replace(found, notes=tuple(f"{path}: {note}" for note in record.notes))
 
 
-# --- reading -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _RecordHeading:
     """The line that names the columns."""
@@ -230,7 +227,6 @@ def _find_heading(text: str) -> _RecordHeading | None:
 
 
 def _column(names: Sequence[tuple[str, str]], known: Sequence[str]) -> int | None:
-    """Return the column of the first known name."""
     plain = [name for name, _ in names]
     return next((plain.index(name) for name in known if name in plain), None)
 
@@ -256,7 +252,6 @@ def _clock_columns(names: Sequence[tuple[str, str]], zone: str) -> tuple[int, ..
 
 
 def _read(path: Path) -> _Record:
-    """Read the columns of a record."""
     refuse_special(path)
     heading = _find_heading(read_head(path))
     if heading is None:

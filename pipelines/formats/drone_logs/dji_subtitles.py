@@ -345,9 +345,6 @@ class DjiSrtFormat(DroneLog):
         return replace(found, notes=(f"{path}: {_note_on_clock(subtitles)}",))
 
 
-# --- content of a subtitle -----------------------------------------------------------------------------
-
-
 def _rows(subtitles: Subtitles) -> DjiRows:
     columns = _columns(subtitles.texts)
     t_ns, timed = subtitles.times()

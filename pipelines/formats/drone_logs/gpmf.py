@@ -147,11 +147,7 @@ def _fixes(path: Path, track: _Track) -> tuple[Int64, Float, Bool, ClockFit | No
     return at_ns, rows[:, :3], np.asarray(fixed), fit
 
 
-# --- track ---------------------------------------------------------------------------------------------
-
-
 def _packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """Yield start and length of each packet of the first track of GPMF in video time, ns, and its bytes."""
     if first_bytes(path, 8)[4:] != b"ftyp":
         return
 

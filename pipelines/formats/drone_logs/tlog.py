@@ -170,9 +170,6 @@ def _vehicle(path: Path, log: _Packets, stated: int | None, messages: frozenset[
     return vehicles[0]
 
 
-# --- content of a log ----------------------------------------------------------------------------------
-
-
 def _topics(log: _Packets, system: int) -> list[UlogTopic]:
     """Make PX4's topics of the messages of one vehicle; each is labelled with the name of its message."""
     topics: list[UlogTopic] = []
@@ -233,9 +230,6 @@ def _wxyz(yaw_pitch_roll_rad: Float) -> Float:
 
 def _quaternion(wxyz: Float) -> dict[str, Float]:
     return {f"q[{k}]": column for k, column in enumerate(wxyz.T)}
-
-
-# --- reading -------------------------------------------------------------------------------------------
 
 
 class _MavlinkPacket(NamedTuple):
@@ -313,7 +307,6 @@ class _Packets:
 
 
 def _read(path: Path) -> _Packets:
-    """Read all packets."""
     found = _Packets(need("pymavlink.dialects.v20.ardupilotmega", "drones"))
     try:
         refuse_marks(path, b"\xfe", b"\xfd")

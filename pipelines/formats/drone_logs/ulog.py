@@ -97,9 +97,6 @@ class UlogFormat(DroneLog):
         )
 
 
-# --- content of a log ----------------------------------------------------------------------------------
-
-
 def telemetry_of(
     path: Path | str,
     topics: Sequence[UlogTopic],
@@ -268,7 +265,6 @@ def _gps_time(topics: Sequence[UlogTopic]) -> ClockFit | None:
 
 
 def _there(topics: Sequence[UlogTopic], names: Sequence[str]) -> list[UlogTopic]:
-    """Return the topics with these names that hold messages."""
     return [topic for name in names for topic in topics if topic.name == name and len(topic)]
 
 
@@ -287,7 +283,6 @@ class UlogTopic:
         return self.label or self.name
 
     def __str__(self) -> str:
-        """Return the name with the number of the instance."""
         return self.label or f"{self.name} (instance {self.instance})"
 
     def __len__(self) -> int:

@@ -214,7 +214,6 @@ class Gathering:
         self._rows: list[Float] = []
 
     def __len__(self) -> int:
-        """Return the number of people so far, over all frames."""
         return len(self._rows)
 
     def contents(self) -> Iterator[tuple[Path, object]]:

@@ -37,7 +37,6 @@ def _is_frame(content: object) -> bool:
 
 
 def _gather_openpose(people: Gathering) -> None:
-    """Add every person, file by file; skip and count files that are no frames."""
     if people.path.is_dir():
         people.digits = changing_digits([_stem(file) for file in json_files(people.path)])
     for file, content in people.contents():
@@ -94,7 +93,6 @@ def _is_alphapose(content: object) -> bool:
 
 
 def _gather_alphapose(people: Gathering) -> None:
-    """Add every person, with the tracker's id."""
     content = load_json(people.path)
     if isinstance(content, dict):
         people.digits = changing_digits(content)
@@ -128,7 +126,6 @@ def _is_coco(content: object) -> bool:
 
 
 def _gather_coco(people: Gathering) -> None:
-    """Add every person; an annotation file also states the joint names and the picture size."""
     content = load_json(people.path)
     boxes = _add_annotations(content, people) if isinstance(content, dict) else _add_results(content, people)
     if boxes and not len(people):
@@ -233,7 +230,6 @@ def _is_easymocap(sample: object) -> bool:
 
 
 def _gather_easymocap(people: Gathering) -> None:
-    """Add every person, file by file, with the id that EasyMocap gave; faces and hands are not read."""
     for file, content in people.contents():
         if not isinstance(content, dict) or not _is_easymocap(content):
             people.dropped["file without annotations"] += 1
@@ -328,7 +324,6 @@ def _is_deeplabcut(head: object) -> bool:
 
 
 def _gather_deeplabcut(people: Gathering) -> None:
-    """Add everybody of every row; its frame is its number, or that in the name of a labelled picture."""
     rows = list(csv.reader(read_text(people.path).split("\n")))
     head = {row[0].strip(): [cell.strip() for cell in row] for row in rows[:4] if row}
     kinds = head.get("coords", [])

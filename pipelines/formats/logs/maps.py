@@ -139,7 +139,6 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def _time_of(message: Message, about: MapTopic) -> int:
-    """Return the stamp to use."""
     if (frame := frame_of(message, about.source)) != about.frame:
         raise damaged(about.source, f"lies in frame {frame!r}, the messages before in {about.frame!r}")
     stamp_ns = nanoseconds(message.value.header.stamp) if about.stamps == "header" else 0
@@ -162,9 +161,6 @@ def _place_at(t_ns: int, about: MapTopic) -> Pose | None:
         max_extrapolation_ns=0,
     )
     return None if np.isnan(position[0, 0]) else (position[0], quaternion[0])
-
-
-# --- maps that replace each other ---------------------------------------------------------------------------
 
 
 def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedMaps:
@@ -307,9 +303,6 @@ def _origin(stated: Any, source: str) -> Pose:
     if not np.isfinite(position).all() or not abs(norm - 1) < 0.1:
         raise damaged(source, f"its origin is no pose ({[*position, *quaternion]})")
     return position, quaternion / norm
-
-
-# --- clouds that accumulate ---------------------------------------------------------------------------------
 
 
 def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:

@@ -213,9 +213,6 @@ def _by_dependency(files: Any) -> list[FileDescriptorProto]:
     return ordered
 
 
-# --- compression -----------------------------------------------------------------------------------------
-
-
 class _Decompressor(Protocol):
     def decompress(self, data: memoryview | bytes, max_length: int) -> bytes: ...
 

@@ -59,9 +59,6 @@ class _Stamps(NamedTuple):
 _Stamped = TypeVar("_Stamped", bound=Stamped)
 
 
-# --- times -----------------------------------------------------------------------------------------------
-
-
 def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
     """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic's pictures.
 
@@ -111,9 +108,6 @@ def _leap_ns(before: Stamped, after: Stamped) -> int:
 def stamp_of(picture: Stamped, stamps: str) -> int:
     """Return the header stamp if it exists and is wanted, else the stamp of receipt."""
     return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
-
-
-# --- pixels ----------------------------------------------------------------------------------------------
 
 
 def is_known(sample: PictureSample) -> bool:

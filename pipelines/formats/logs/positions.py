@@ -120,7 +120,6 @@ def _read(
     topic: str,
     numbers: Callable[[Any], Sequence[float]],
 ) -> LoggedRows:
-    """Read the numbers of every message of a topic."""
     header_ns, receive_ns, values = array("q"), array("q"), array("d")
     for message in recording.messages([topic]):
         value = message.value

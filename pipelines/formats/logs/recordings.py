@@ -365,11 +365,9 @@ class OpenLog:
         self._topics = {key: self._summary(*key) for key in sorted(self._channels)}
 
     def __enter__(self) -> OpenLog:
-        """Return the log itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close the files."""
         for part in self.parts:
             part.close()
 

@@ -241,9 +241,6 @@ def _numbered(file: Path) -> tuple[str, int] | None:
     return (match[1], int(match[2])) if match else None
 
 
-# --- databases -------------------------------------------------------------------------------------------
-
-
 class Sqlite3Part(LogPart):
     """sqlite3 file; its table `messages` is read row by row, so that damage costs only the rows it hits."""
 

@@ -57,13 +57,11 @@ def _refuse_cut(path: Path, stated: int, there: int) -> None:
 
 
 def _records(path: Path, body: Bytes, count: int, record: np.dtype[Any]) -> NDArray[Any]:
-    """Return the first `count` records of the bytes."""
     _refuse_cut(path, count, len(body) // max(record.itemsize, 1))
     return body[: count * record.itemsize].view(record)
 
 
 def _joined(columns: Sequence[NDArray[Any]]) -> Float:
-    """Stack three columns of any numeric type, [N, 3]."""
     with np.errstate(invalid="ignore"):  # signalling NaNs of damaged floats warn; they are counted later
         return np.stack([column.astype(np.float64).ravel() for column in columns], axis=1)
 
@@ -277,7 +275,6 @@ def _header(path: Path) -> Any:
 
 
 def _add_points(path: Path, header: Any, voxels: VoxelSet) -> dict[str, int]:
-    """Add the usable points of each chunk; count the others by cause."""
     laspy = need("laspy", "las")
     lost: Counter[str] = Counter()
     read, stated = 0, int(header.point_count)

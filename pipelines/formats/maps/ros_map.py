@@ -185,7 +185,6 @@ def _picture(image: Path) -> tuple[Float, Bool]:
 
 @contextmanager
 def _opened(image: Path) -> Iterator[Image.Image]:
-    """Open a picture; refuse too large a one before it is decoded."""
     from PIL import Image
 
     with warnings.catch_warnings():

@@ -103,7 +103,6 @@ def _add_person(
 
 
 def _add_camera(asset: GltfAsset, name: str, track: Trajectory, lens: Intrinsics, t_ns: Int64) -> None:
-    """Add a camera with its poses nearest to the moments."""
     after = np.clip(np.searchsorted(track.t_ns, t_ns), 0, len(track.t_ns) - 1)
     before = np.maximum(after - 1, 0)
     is_before = np.abs(track.t_ns[before] - t_ns) < np.abs(track.t_ns[after] - t_ns)
@@ -144,7 +143,6 @@ def _turned_to(direction: Float) -> Float:
 
 
 def _octahedron(radius: float) -> tuple[Float, Int64]:
-    """Return corners [6, 3] and outward triangles [8, 3]."""
     corners = radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     triangles = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
     return corners.astype(np.float64), np.array(triangles)

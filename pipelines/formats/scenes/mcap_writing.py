@@ -73,13 +73,11 @@ class Ros2Recording:
         self._sequence: dict[str, int] = {}
 
     def __enter__(self) -> Ros2Recording:
-        """Return the recording itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write index and summary, and close the file."""
         try:
             if kind is None:
                 self._writer.finish()  # type: ignore[no-untyped-call]  # left without annotations there
@@ -280,7 +278,6 @@ def _labels(recording: Recording, names: Sequence[str], people: Sequence[int]) -
 
 
 def _series(t_ns: int, topic: str, labels: Sequence[str], values: Sequence[float]) -> Entry:
-    """Return one message."""
     fields = {"header": {"stamp": t_ns, "frame_id": ""}, "name": list(labels), "position": list(values)}
     return t_ns, topic, "sensor_msgs/msg/JointState", fields
 

@@ -375,7 +375,6 @@ def _document(config: _Values, folder: _Values, points: Sequence[dict[str, Any]]
 
 
 def _add(parent: ET.Element, values: _Values) -> None:
-    """Add elements of WPML: texts, elements of their own, or several of one name."""
     for name, value in values.items():
         for one in value if isinstance(value, list) else [value]:
             child = ET.SubElement(parent, f"{{{_WPML}}}{name}")

@@ -155,7 +155,6 @@ def _log_doubts(rr: Any, stream: Any, recording: Recording, start_ns: int) -> No
 
 
 def _log_series(rr: Any, stream: Any, entity: str, t_ns: Int64, values: Float) -> None:
-    """Log the values [N] that are finite."""
     known = np.isfinite(values)
     if known.any():
         stream.send_columns(entity, [_times(rr, t_ns[known])], rr.Scalars.columns(scalars=values[known]))

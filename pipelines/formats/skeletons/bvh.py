@@ -262,7 +262,6 @@ def _read(path: Path) -> _BvhFile:
 
 
 def _bones(path: Path, words: list[str]) -> list[_FileBone]:
-    """Parse the hierarchy, parents first, in the order of the file."""
     bones: list[_FileBone] = []
     above: list[int | None] = []  # the open blocks: bones, and None for an end site
     coming = iter(words)
@@ -324,7 +323,6 @@ def _stated(path: Path, line: str, key: str) -> float:
 
 
 def _numbers(path: Path, body: str, channels: int, first_line: int) -> Float:
-    """Parse the frames [T, channels]."""
     if not channels or not body.strip():
         raise empty(path, "holds no frames or no channels")
     rows: list[Float] = []

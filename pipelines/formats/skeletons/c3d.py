@@ -180,7 +180,6 @@ def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) ->
 
 
 def _frames(contents: Any) -> int:
-    """Return the number of frames, by the largest of its counts."""
     read = int(np.shape(contents["data"]["points"])[2])
     first, last = (_words(contents, f"ACTUAL_{end}_FIELD") for end in ("START", "END"))
     return max(read, last - first + 1) if first is not None and last is not None else read
@@ -262,9 +261,6 @@ def _text(contents: Any, group: str, name: str) -> str | None:
 def _number(contents: Any, group: str, name: str) -> float | None:
     values = _values(contents, group, name)
     return float(values[0]) if len(values) else None
-
-
-# --- writing -------------------------------------------------------------------------------------------
 
 
 class C3dExport:

@@ -130,7 +130,6 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
 
 
 def _spread(motion: JointMotion, even_ns: Int64, index: Int64) -> JointMotion:
-    """Put the samples as they are at their frames; NaN in between."""
     row = np.full(len(even_ns), -1)
     row[index] = np.arange(len(index))
     return _taken(motion, row, replace(motion, t_ns=even_ns, position=_rows(motion.position, row)))
@@ -338,7 +337,6 @@ def _read_wide(path: Path, text: str, columns: dict[str, int], unit: str, axes: 
 
 
 def _find_heading(text: str) -> Heading | None:
-    """Parse the first line; None if it names no time, joint or position."""
     heading = find_heading(text.split("\n", 1)[0], delimiters=",")
     return heading if heading and heading.names.keys() >= {"joint", "x", "y", "z"} else None
 
@@ -362,7 +360,6 @@ def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
 
 
 def _dense(path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, position: Float) -> JointMotion:
-    """Convert long rows [N] to dense arrays [T, P, J, 3]."""
     import pandas as pd
 
     t_ns, row = np.unique(stamps, return_inverse=True)

@@ -79,7 +79,6 @@ def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
 
 
 def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tuple[list[str], Float]:
-    """Read times as text, and coordinates [T, M, 3]."""
     times: list[str] = []
     values: list[list[float]] = []
     decimal_commas = not any("." in line for line in lines[:10])

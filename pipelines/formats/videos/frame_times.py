@@ -98,9 +98,6 @@ def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
     return np.where(known, stamps.t_ns[nearest], 0), known
 
 
-# --- CSV ------------------------------------------------------------------------------------------------
-
-
 def _find_heading(text: str) -> tuple[Heading, int | None] | None:
     """Parse the first line that is not blank, and the column of frame numbers; None if it names no time."""
     first = next(((k, line) for k, line in enumerate(text.split("\n", 100)[:100]) if line.strip()), None)
@@ -136,9 +133,6 @@ def _frame_numbers(cells: list[str]) -> tuple[Int64, Bool]:
     matches = [re.fullmatch(r"\s*(\d{1,18})(?:\.0*)?\s*", cell or "") for cell in cells]
     frame = np.array([int(match[1]) if match else 0 for match in matches], dtype=np.int64)
     return frame, np.array([match is not None for match in matches], dtype=np.bool_)
-
-
-# --- subtitles ------------------------------------------------------------------------------------------
 
 
 def _read_subtitles(path: Path) -> FrameStamps:

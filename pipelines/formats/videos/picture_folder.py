@@ -228,7 +228,6 @@ class FolderPictures:
         self._size: tuple[int, ...] | None = None
 
     def __enter__(self) -> Self:
-        """Return the pictures themselves."""
         return self
 
     def __exit__(self, *exception: object) -> None:

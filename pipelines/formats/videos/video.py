@@ -224,11 +224,9 @@ class VideoReader:
         self.index = _index(self._scan, self._stream, self._next[1])
 
     def __enter__(self) -> Self:
-        """Return the reader itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Close the file."""
         self.close()
 
     def close(self) -> None:
@@ -283,7 +281,6 @@ class VideoReader:
             self._next = next(self._coming, None)
 
     def _begin(self) -> None:
-        """Open the file and decode from the beginning."""
         self._container, self._stream = open_container(self._path)
         self._coming = _numbered(self._container, self._stream, self._scan, sought=False)
         self._next = next(self._coming, None)
@@ -448,7 +445,6 @@ def _frames_before_the_first(path: Path, scan: _Scan) -> int:
 def _decoded(
     container: InputContainer, stream: VideoStream, first: int | None, *, sought: bool = False
 ) -> Iterator[VideoFrame]:
-    """Yield the frames from a stamp on, after a seek from that of the first key frame on."""
     from av.error import FFmpegError
 
     for packet in chain(packets(container, stream), (None,)):
