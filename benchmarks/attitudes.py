@@ -88,7 +88,7 @@ def measured(name: str, folder: Path, draws: int) -> Iterator[list[str]]:
         t_ns, position = own["t_ns"].to_numpy(np.int64), own[["x", "y", "z"]].to_numpy(np.float64)
         turned = own[["qx", "qy", "qz", "qw"]].to_numpy(np.float64)
         row = [name, camera, f"{np.linalg.norm(position[-1] - position[0]):.1f}"]
-        began_s, lens = time.process_time(), entry.intrinsics.intrinsics()
+        began_s, lens = time.process_time(), entry.intrinsics
         try:
             with VideoReader(place / f"{camera}.mp4") as pictures:
                 read = [pictures.read(int(number)) for number in keys["frame"]]

@@ -51,10 +51,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.flights import CAMERAS, PEER, REAL, real_flight
 from benchmarks.results import fixed, markdown_table
 from pipelines.formats.skeletons.trc import FORMAT as TRC
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Intrinsics
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.session.description import IntrinsicsEntry, read_description
+from pipelines.session.description import read_description
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
 TUNED, KEPT = ("a", "b"), ("c", "d")
@@ -78,7 +78,7 @@ _SHAKE_HZ_DEG = ((6.3, 0.06), (8.9, 0.05), (11.2, 0.04))
 class Shot:
     """Real camera of the recording: its intrinsics and its pose."""
 
-    intrinsics: IntrinsicsEntry
+    intrinsics: Intrinsics
     position: Float  # [3] m
     world_from_camera: Float  # [3, 3]
 

@@ -108,7 +108,7 @@ def accuracy(seed: int) -> Iterator[list[str]]:
 
 def batches(count: int, seconds: float = 4.0) -> Iterator[list[str]]:
     """Ingest and reconstruct small flights with one worker and with two; the best of three counts."""
-    settings = BatchSettings(stages=("ingest", "reconstruct"), method="robust")
+    settings = BatchSettings(("ingest", "reconstruct"), ReconstructSettings("robust"))
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
         place = Path(folder)
         manifests = [

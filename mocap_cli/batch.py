@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 def _settings(stages: str, pictures: ChosenPictures, **others: Any) -> BatchSettings:
     from pipelines.batch import BatchSettings
+    from pipelines.reconstruct import ReconstructSettings
 
     names = tuple(name.strip() for name in stages.split(",") if name.strip())
-    start_s, end_s = pictures.start_s, pictures.end_s
-    return BatchSettings(stages=names, every=pictures.every, start_s=start_s, end_s=end_s, **others)
+    return BatchSettings(names, ReconstructSettings(**vars(pictures), **others))
 
 
 _settings_options = grouped(

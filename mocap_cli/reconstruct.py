@@ -53,14 +53,7 @@ def _settings(pictures: ChosenPictures, smooth: str | None, **others: Any) -> Re
             fill_s, smooth = float(fill[1]), fill[2]
         except ValueError:
             raise click.BadParameter(f"{fill[1]!r} is no number", param_hint="--smooth") from None
-    return ReconstructSettings(
-        every=pictures.every,
-        start_s=pictures.start_s,
-        end_s=pictures.end_s,
-        fill_s=fill_s,
-        smooth=smooth,
-        **others,
-    )
+    return ReconstructSettings(**vars(pictures), fill_s=fill_s, smooth=smooth, **others)
 
 
 _settings_options = grouped(

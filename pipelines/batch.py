@@ -14,9 +14,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
-from pipelines.geometry.triangulation import Method
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.replan import replan
@@ -48,11 +47,7 @@ class BatchSettings:
     """Settings for every flight."""
 
     stages: tuple[str, ...] = STAGES
-    method: Method | Literal["refined", "auto"] = "auto"
-    detector: str = "blazepose"
-    every: int = 1
-    start_s: float | None = None
-    end_s: float | None = None
+    reconstruct: ReconstructSettings = field(default_factory=ReconstructSettings)
 
 
 @dataclass(frozen=True)
@@ -200,15 +195,8 @@ def _run(stage: str, job: Job) -> bool:
             make_folder(job.session.parent)
             return ingest(job.flight, job.session, force=job.force).skipped
         case "reconstruct":
-            chosen = job.settings
-            settings = ReconstructSettings(
-                chosen.method,
-                detector=chosen.detector,
-                every=chosen.every,
-                start_s=chosen.start_s,
-                end_s=chosen.end_s,
-            )
-            return reconstruct(job.session, settings, workers=job.workers, force=job.force).skipped
+            settings, workers = job.settings.reconstruct, job.workers
+            return reconstruct(job.session, settings, workers=workers, force=job.force).skipped
         case "replan-compare":
             return replan(job.session, force=job.force).skipped
         case _:

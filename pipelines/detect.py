@@ -15,7 +15,7 @@ from collections import Counter, deque
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -136,8 +136,6 @@ def detect(
     media = cameras_to_detect(description)
     chosen = find_detector(detector)
     if not media:
-        if detector != DEFAULT_DETECTOR:
-            progress.note(f"--detector {detector} has no use: every camera has keypoints, or no pictures")
         return None
     refuse_changed_pictures(session.folder, description, media)
     settings = {
@@ -153,9 +151,9 @@ def detect(
     looked_at = _looked_at(work, chosen, media)
     kept = None if force else _kept(session, settings, looked_at)
     hints = hints_of(description, ingested, media) if kept is None else hints_from(kept)
-    run = session.begin(
-        DETECT, settings=settings, inputs=looked_at | _times(ingested, media) | hints, force=force
-    )
+    tables = [f"cameras/{name}/frames.parquet" for name in media]
+    times = {name: ingested.outputs[name] for name in tables}
+    run = session.begin(DETECT, settings=settings, inputs=looked_at | times | hints, force=force)
     if run.finished:
         return run.record
     if kept is not None:
@@ -169,42 +167,32 @@ def detect(
     blocks = [block for name in media for block in work.blocks(name)]
     pictures = sum(work.pictures(block) for block in blocks)
     if not pictures:
-        problem = f"no picture lies {_span_words(start_s, end_s)}"
+        start = "" if start_s is None else f" from {start_s:g} s on"
+        problem = f"no picture lies in the flight{start}" + ("" if end_s is None else f" before {end_s:g} s")
         raise DataError(session.folder, problem, "look at `mocap info`, or leave it out", code="no-overlap")
     progress.start("Detecting keypoints", pictures)
     workers = 1 if pictures < MIN_PICTURES_FOR_PROCESSES else workers
     folders = _detected(run, work, blocks, chosen, people == 1, workers, executor, progress)
     counts = _assemble(run.folder, media, blocks, folders)
-    _refuse_nobody(session.folder, counts, pictures)
+    lost = {name: camera["undecoded"] for name, camera in counts.items()}
+    if not any(camera["detections"] for camera in counts.values()):
+        undecoded = f": {sum(lost.values())} of {pictures} cannot be decoded" if any(lost.values()) else ""
+        problem = f"nobody was found in any picture{undecoded}"
+        remedy = "look at the pictures, or give keypoints"
+        raise DataError(session.folder, problem, remedy, code="nobody-found")
     joints = list(read_json(folders[0] / "counts.json")["joints"])
     rows = {name: list(work.span(name)) for name in media}
-    warnings = _lost_pictures(counts)
+    warnings = [
+        f"{name}: {gone} of {gone + counts[name].get('frames', 0)} pictures cannot be decoded"
+        for name, gone in lost.items()
+        if gone
+    ]
     for note in (f"keypoints detected by {chosen.title}", *warnings):
         progress.note(note)
     return run.publish(
         counts={"detector": chosen.title, "joints": joints, "cameras": counts, "rows": rows},
         warnings=warnings,
     )
-
-
-def _refuse_nobody(folder: Path, counts: Mapping[str, Mapping[str, int]], pictures: int) -> None:
-    if any(camera["detections"] for camera in counts.values()):
-        return
-    lost = sum(camera["undecoded"] for camera in counts.values())
-    raise DataError(
-        folder,
-        "nobody was found in any picture" + (f": {lost} of {pictures} cannot be decoded" if lost else ""),
-        "look at the pictures, or give keypoints",
-        code="nobody-found",
-    )
-
-
-def _lost_pictures(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    return [
-        f"{name}: {gone} of {gone + camera.get('frames', 0)} pictures cannot be decoded"
-        for name, camera in counts.items()
-        if (gone := camera["undecoded"])
-    ]
 
 
 # --- what keypoints depend on --------------------------------------------------------------------------
@@ -227,7 +215,7 @@ def hints_of(description: Description, ingested: StageRecord, cameras: Iterable[
         *(
             [
                 name,
-                [entry.intrinsics.model_dump(), entry.poses.static, entry.pose_noise],
+                [asdict(entry.intrinsics), entry.poses.static, entry.pose_noise],
                 [ingested.outputs[f"cameras/{name}/{table}.parquet"] for table in ("frames", "poses")],
             ]
             for name, entry in entries.items()
@@ -248,11 +236,6 @@ def _looked_at(work: _Work, detector: Detector, media: Mapping[str, MediaEntry])
     others = {f"pictures of {name}" for name in work.description.cameras if name not in media}
     recorded = {name: it for name, it in work.description.recorded.items() if name not in others}
     return models | frames | recorded
-
-
-def _times(ingested: StageRecord, media: Mapping[str, MediaEntry]) -> dict[str, str]:
-    tables = [f"cameras/{name}/frames.parquet" for name in media]
-    return {name: ingested.outputs[name] for name in tables}
 
 
 def _kept(
@@ -280,28 +263,17 @@ def _store_with_new_times(work: _Work, media: Mapping[str, MediaEntry], folder: 
 # --- the work ------------------------------------------------------------------------------------------
 
 
-class _Hints:
-    """Places of the logged people in the pictures of the cameras."""
-
-    def __init__(
-        self, folder: Path, description: Description, cameras: Iterable[str], *, only_one: bool
-    ) -> None:
-        self._description = description
-        logged = logged_people(folder, description)
-        self._people = logged[:1] if only_one else logged
-        self._tracks = {
-            name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
-            for name in (cameras if self._people else ())
-        }
-
-    def at(self, camera: str, t_ns: Int64) -> list[tuple[Hint | None, ...]]:
-        """Return the hints of all people for each of a camera's pictures of these times [T]."""
-        if not self._people:
-            return [()] * len(t_ns)
-        entry, between = self._description.cameras[camera], self._description.pose_interpolation
-        track = self._tracks[camera]
-        of_each = [actor_hints(each, camera, entry, track, between, t_ns) for each in self._people]
-        return list(zip(*of_each, strict=True))
+def _hints_at(
+    folder: Path, description: Description, camera: str, t_ns: Int64, *, only_one: bool
+) -> list[tuple[Hint | None, ...]]:
+    """Return where logged people are in each of a camera's pictures of these times [T]."""
+    people = logged_people(folder, description)[: 1 if only_one else None]
+    if not people:
+        return [()] * len(t_ns)
+    track = trajectory_from(read_table(folder / "cameras" / camera / "poses.parquet", POSES))
+    entry, between = description.cameras[camera], description.pose_interpolation
+    of_each = [actor_hints(each, camera, entry, track, between, t_ns) for each in people]
+    return list(zip(*of_each, strict=True))
 
 
 class _Work:
@@ -375,12 +347,6 @@ def _networks(detector: Detector) -> KeypointNetworks:
     return networks
 
 
-def _span_words(start_s: float | None, end_s: float | None) -> str:
-    start = "" if start_s is None else f" from {start_s:g} s on"
-    end = "" if end_s is None else f" before {end_s:g} s"
-    return f"in the flight{start}{end}"
-
-
 @dataclass(frozen=True)
 class _DetectionOrder:
     """A block for a worker."""
@@ -403,12 +369,33 @@ def detect_block(order: _DetectionOrder) -> dict[str, bytes]:
         problem = "has other model files on a machine of the Dask cluster, or none"
         remedy = "every machine needs the same ones (see `mocap models`)"
         raise DataError(order.detector.name, problem, remedy, code="wrong-worker")
-    description = read_description(folder)
-    work = _Work(folder, description, order.every, (None, None))
-    hints = _Hints(folder, description, [order.block.camera], only_one=order.only_one)
-    with TemporaryDirectory() as place:
-        _produce(work, hints, order.detector, order.only_one, order.block, Path(place))
-        return contents_of(Path(place))
+    description, camera = read_description(folder), order.block.camera
+    frame, t_ns = _Work(folder, description, order.every, (None, None)).frames(order.block)
+    networks = _networks(order.detector)
+    tracker = PeopleTracker(networks, only_one=order.only_one)
+    hints = _hints_at(folder, description, camera, t_ns, only_one=order.only_one)
+    found: list[tuple[int, int, Float, Float]] = []
+    undecoded = 0
+    numbers = frame.tolist()
+    # Left early, the pictures must not be closed while the next one is being decoded.
+    with (
+        open_pictures(folder, description, camera) as pictures,
+        closing(_decoded_ahead(pictures, numbers)) as decoded,
+    ):
+        for number, picture, hints_here in zip(numbers, decoded, hints, strict=True):
+            if picture is None:
+                undecoded += 1
+                continue
+            found += [
+                (number, seen.track, seen.person.xy, seen.person.confidence)
+                for seen in tracker.step(picture, hints=hints_here)
+            ]
+    counts = {**tracker.counts, "detections": len(found), "undecoded": undecoded}
+    with TemporaryDirectory() as name:
+        place = Path(name)
+        write_table(place / "keypoints.parquet", _table(found, networks, frame, t_ns), KEYPOINTS)
+        write_json(place / "counts.json", {"joints": list(networks.joints), "counts": counts})
+        return contents_of(place)
 
 
 def _detected(
@@ -435,38 +422,6 @@ def _detected(
 
 def _never(place: Path) -> None:
     raise RuntimeError(f"{place} was finished before")
-
-
-def _produce(
-    work: _Work,
-    hints: _Hints,
-    detector: Detector,
-    only_one: bool,
-    block: Block,
-    folder: Path,
-) -> None:
-    networks = _networks(detector)
-    frame, t_ns = work.frames(block)
-    tracker = PeopleTracker(networks, only_one=only_one)
-    found: list[tuple[int, int, Float, Float]] = []
-    undecoded = 0
-    numbers = frame.tolist()
-    # Left early, the pictures must not be closed while the next one is being decoded.
-    with (
-        open_pictures(work.folder, work.description, block.camera) as pictures,
-        closing(_decoded_ahead(pictures, numbers)) as decoded,
-    ):
-        for number, picture, hints_here in zip(numbers, decoded, hints.at(block.camera, t_ns), strict=True):
-            if picture is None:
-                undecoded += 1
-                continue
-            found += [
-                (number, seen.track, seen.person.xy, seen.person.confidence)
-                for seen in tracker.step(picture, hints=hints_here)
-            ]
-    write_table(folder / "keypoints.parquet", _table(found, networks, frame, t_ns), KEYPOINTS)
-    counts = {**tracker.counts, "detections": len(found), "undecoded": undecoded}
-    write_json(folder / "counts.json", {"joints": list(networks.joints), "counts": counts})
 
 
 def _decoded_ahead(pictures: CameraPictures, numbers: list[int]) -> Generator[Picture | None]:

@@ -193,7 +193,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         motion,
         cameras,
         refined={} if record is None else refined_poses(folder, record),
-        lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
+        lenses={name: camera.intrinsics for name, camera in description.cameras.items()},
         maps=lambda: each_map(folder) if description.map else iter(()),
         pictures=_pictures(folder, description, record, pictures_hz),
         angles=lambda: _reconstructed(folder, record, "angles", ANGLES),
@@ -438,12 +438,9 @@ def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) ->
 
 def _earlier(record: Path) -> dict[str, dict[str, Any]]:
     """Read which files earlier exports wrote into a folder, by name; empty if the record cannot be read."""
-    if not record.is_file():
-        return {}
     try:
-        files = read_json(record).get("files")
+        files = read_json(record).get("files") if record.is_file() else {}
     except DataError:
         return {}
-    if not isinstance(files, dict):
-        return {}
-    return {name: facts for name, facts in files.items() if isinstance(facts, dict)}
+    named = files.items() if isinstance(files, dict) else ()
+    return {name: facts for name, facts in named if isinstance(facts, dict)}

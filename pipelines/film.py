@@ -175,7 +175,9 @@ def film(
             ]
             points = np.stack([own for own, _ in measured], axis=1)
             reconstructed[name] = points.reshape(len(points), -1, 3)
-            metrics[name] = _over_people([who.name for who in setting.people], [own for _, own in measured])
+            each = [own for _, own in measured]
+            by_person = dict(zip((who.name for who in setting.people), each, strict=True))
+            metrics[name] = each[0] if len(each) == 1 else _means(each) | {"by_person": by_person}
             _write_arm(run.folder / name, arm, points, parts)
         true_joints = {
             name: np.concatenate([of.joints for of in arm.people], axis=1) for name, arm in arms.items()
@@ -376,13 +378,6 @@ def _measured(
         desired_tilt_deg=desired_tilt_deg,
     )
     return points, figures | {"fallback": doubt}
-
-
-def _over_people(names: Sequence[str], each: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of an arm: means over people, and with several of them those of each `by_person`."""
-    if len(each) == 1:
-        return each[0]
-    return _means(each) | {"by_person": dict(zip(names, each, strict=True))}
 
 
 def _means(each: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -40,7 +40,7 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import recognise
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
 from pipelines.session.registries import MapFormat
-from pipelines.session.stages import Run, Stage, StageRecord, locked, note_sources, usable_record
+from pipelines.session.stages import Stage, StageRecord, locked, note_sources, usable_record
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.tables import (
     ACTOR,
@@ -141,6 +141,7 @@ def ingest(
         check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
         sources = hash_sources(flight, flight_path.parent, progress)
         reader.hashes, reader.progress, reader.force = sources, progress, force
+        reader.check_sources = check_sources
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
@@ -151,7 +152,15 @@ def ingest(
                 return Ingested(target, run.record, stored_description, skipped=True)
 
             progress.start("Reading cameras", len(flight.cameras))
-            entries, warnings = _store_cameras(run, reader, list(flight.cameras), check_sources, progress)
+            entries: dict[str, CameraEntry] = {}
+            warnings: list[str] = []
+            for name in flight.cameras:
+                chunk = run.chunk(name, partial(reader.store_camera, name))
+                shutil.copytree(chunk / "tables", run.folder / "cameras" / name)
+                stored = read_json(chunk / "entry.json")
+                entries[name] = CameraEntry.model_validate(stored["entry"])
+                warnings += stored["warnings"]
+                progress.advance()
             _check_overlap(flight_path, entries)
             truth = reader.store_truth(run.folder, entries)
             actors = reader.store_actors(run.folder, entries)
@@ -162,9 +171,11 @@ def ingest(
             warnings += reader.take_notes()
             warnings += assumptions_as_warnings(flight.assumptions)
 
-            tracks = {name: _track(run, name) for name in entries}
+            tables = {name: run.folder / "cameras" / name / "poses.parquet" for name in entries}
+            tracks = {name: trajectory_from(read_table(path, POSES)) for name, path in tables.items()}
             doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
-            doubts += doubts_of_places(tracks, reader.map_box) + reader.map_doubts + reader.unused_gimbals()
+            doubts += doubts_of_places(tracks, reader.map_box) + reader.poses.map_doubts
+            doubts += reader.unused_gimbals()
             warnings += [doubt.as_warning() for doubt in doubts]
 
             description = Description(
@@ -210,10 +221,13 @@ class _FlightReader:
         self._notes: list[str] = []
         self._logs = FlightLogs(flight, base, note)
         self._files = FlightFiles(flight, flight_path)
-        self._poses = FlightPoses(flight, flight_path, self._logs, self._files, max_gap_ns=gap_ns, note=note)
-        self._cameras = FlightCameras(flight_path, self._logs, self._files, self._poses.triggers, note)
+        self.poses = FlightPoses(flight, flight_path, self._logs, self._files, max_gap_ns=gap_ns, note=note)
+        self._cameras = FlightCameras(flight_path, self._logs, self._files, self.poses.triggers, note)
         self.hashes: Mapping[str, str] = {}  # SHA-256 of the sources by their names in the manifest
         self.progress: Progress = Silent()
+        self.check_sources: Callable[[], None] = lambda: (
+            None
+        )  # raises an error if they were changed meanwhile
         self.force = False  # maps of pictures of an earlier ingest are not used
         self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 
@@ -226,7 +240,7 @@ class _FlightReader:
     def refuse_unfit(self) -> None:
         """Refuse files, options and mounts that do not belong where they stand."""
         self._files.refuse_other_options()
-        self._poses.refuse_unfit()
+        self.poses.refuse_unfit()
 
     def _take_note(self, line: str) -> None:
         self._notes.append(as_urls(line))
@@ -256,6 +270,7 @@ class _FlightReader:
         )
         warnings = list(dict.fromkeys(data.notes + self.take_notes()))
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
+        self.check_sources()
 
     def _pose_axes(self, camera: CameraSources) -> Axes:
         pose = camera.pose
@@ -287,7 +302,7 @@ class _FlightReader:
                 detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics)
             detections = near_picture(detections, intrinsics)
         frames = self._cameras.frames(name, camera, video, detections)
-        trajectory = self._poses.trajectory(name, camera, frames)
+        trajectory = self.poses.trajectory(name, camera, frames)
         pose_noise = camera.pose_noise
         if pose_noise:
             noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", pose_noise)
@@ -316,8 +331,8 @@ class _FlightReader:
             frames,
             trajectory,
             media=self._cameras.media(camera, frames, self._session),
-            log_clock=self._poses.log_clock(camera),
-            still=self._poses.is_still(camera),
+            log_clock=self.poses.log_clock(camera),
+            still=self.poses.is_still(camera),
             notes=self.take_notes(),
             pose_noise=pose_noise,
             picture_map=picture_map,
@@ -361,7 +376,7 @@ class _FlightReader:
             places,
             refine_focal=camera.intrinsics.assumed,
             pose_noise=camera.pose_noise,
-            satellite_sigma_m=self._poses.satellite_sigma_m(camera),
+            satellite_sigma_m=self.poses.satellite_sigma_m(camera),
             kept=kept,
             note=self._take_note,
             progress=self.progress,
@@ -369,8 +384,8 @@ class _FlightReader:
 
     def origin(self) -> OriginEntry | None:
         """Return the world's origin on Earth, if known; note cameras with different height references."""
-        self._poses.doubt_heights()
-        found = self._poses.origin()
+        self.poses.doubt_heights()
+        found = self.poses.origin()
         if found is None:
             return None
         place = found.place
@@ -391,7 +406,7 @@ class _FlightReader:
         if motion is not None and truth.file:
             place = located(base, truth.file)
             own_axes = truth.axes is not None or truth.up is not None
-            position = self._poses.joints(place, motion.position, own_axes=own_axes)
+            position = self.poses.joints(place, motion.position, own_axes=own_axes)
             motion = replace(motion, position=position)
             refuse_no_overlap(named(base, truth.file), motion.t_ns, entries)
             write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
@@ -402,7 +417,7 @@ class _FlightReader:
 
             tables = []
             for name, stated in truth.poses.items():
-                poses = self._poses.true_poses(stated)
+                poses = self.poses.true_poses(stated)
                 tables.append(pose_table(poses).assign(camera=name))
                 if poses.dropped:
                     poses_dropped[name] = poses.dropped
@@ -425,7 +440,7 @@ class _FlightReader:
         place = located(self._flight_path.parent, stated)
         bodies = read_table(place, BODY)
         centre = bodies[["x", "y", "z"]].to_numpy(np.float64)
-        bodies[["x", "y", "z"]] = self._poses.joints(place, centre, own_axes=False)
+        bodies[["x", "y", "z"]] = self.poses.joints(place, centre, own_axes=False)
         write_table(folder / "truth_body.parquet", bodies, BODY)
         shape = located(self._flight_path.parent, shape_file(stated))
         write_table(folder / "truth_body_shape.parquet", read_table(shape, BODY_SHAPE), BODY_SHAPE)
@@ -448,7 +463,7 @@ class _FlightReader:
         """Write the logged positions of people."""
         found, tracks = [], []
         for name, actor in self._flight.logged_people.items():
-            trajectory = self._poses.actor(name, actor)
+            trajectory = self.poses.actor(name, actor)
             refuse_no_overlap(named(self._flight_path.parent, actor.file), trajectory.t_ns, entries)
             if trajectory.dropped:
                 self._notes.append(f"{name or 'actor'}: dropped: {losses(trajectory.dropped)}")
@@ -490,7 +505,7 @@ class _FlightReader:
             reader = recognise(file, MapFormat, "map", name=stated.format)
             occupancy = reader.read_map(file, resolution_m=stated.resolution_m)
             held, dropped = store_map(folder, self._near_origin(file, [occupancy])), occupancy.dropped
-            if occupancy.crs and not (stated.crs or self._poses.origin()):
+            if occupancy.crs and not (stated.crs or self.poses.origin()):
                 named = " ".join(occupancy.crs.split())[:60]
                 self._notes.append(f"{path}: its coordinates, of {named}, are taken to be the world's")
             if self._flight.world.frame == "ned":
@@ -518,7 +533,7 @@ class _FlightReader:
         tables, found = [], {}
         for name in (camera for camera in self._flight.cameras if camera in plan):
             stated = plan[name].file
-            sent = self._poses.planned(plan[name])
+            sent = self.poses.planned(plan[name])
             refuse_no_overlap(named(self._flight_path.parent, stated), sent.t_ns, entries)
             if sent.dropped:
                 self._notes.append(f"{name}: commands dropped: {losses(sent.dropped)}")
@@ -535,11 +550,6 @@ class _FlightReader:
             )
             remedy = "check its clock, or take `stamps: receive`"
             raise DataError(f"{self._flight_path}: map.file {log}", problem, remedy, code="no-overlap")
-
-    @property
-    def map_doubts(self) -> list[Doubt]:
-        """Doubts of the places of the maps that were stored."""
-        return self._poses.map_doubts
 
     def unused_gimbals(self) -> list[Doubt]:
         """Doubt cameras that are fixed to a body whose log holds the angles of a gimbal that nobody names."""
@@ -570,38 +580,10 @@ class _FlightReader:
         """Yield maps in the world; errors as in `FlightPoses.map`."""
         stated = self._flight.map
         for occupancy in maps:
-            placed = self._poses.map(source, occupancy, stated.crs if stated else None)
+            placed = self.poses.map(source, occupancy, stated.crs if stated else None)
             high = placed.origin + np.array(placed.probability.shape) * placed.resolution_m
             self.map_box = self.map_box or (placed.origin, high)
             yield placed
-
-
-def _store_cameras(
-    run: Run,
-    reader: _FlightReader,
-    names: Sequence[str],
-    check_sources: Callable[[], None],
-    progress: Progress,
-) -> tuple[dict[str, CameraEntry], list[str]]:
-    entries: dict[str, CameraEntry] = {}
-    warnings: list[str] = []
-    for name in names:
-        chunk = run.chunk(name, partial(_store_camera, reader, name, check_sources))
-        shutil.copytree(chunk / "tables", run.folder / "cameras" / name)
-        stored = read_json(chunk / "entry.json")
-        entries[name] = CameraEntry.model_validate(stored["entry"])
-        warnings += stored["warnings"]
-        progress.advance()
-    return entries, warnings
-
-
-def _track(run: Run, name: str) -> Trajectory:
-    return trajectory_from(read_table(run.folder / "cameras" / name / "poses.parquet", POSES))
-
-
-def _store_camera(reader: _FlightReader, name: str, check_sources: Callable[[], None], folder: Path) -> None:
-    reader.store_camera(name, folder)
-    check_sources()
 
 
 def _refuse_unsound(flight_path: Path, description: Description) -> None:

@@ -198,11 +198,14 @@ def reconstruct(
         detected = _detected(session, settings, workers, force, executor, progress)
         background, left_out = _followed(session, description, settings, workers, force, executor, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
+        inputs = dict(ingested.outputs) | (detected.outputs | hints_from(detected) if detected else {})
+        inputs |= background.outputs if background else {}
+        inputs |= {"calibration of confidences": sha256_of(measured)} if measured else {}
         run = session.begin(
             RECONSTRUCT,
             # The detector's name is that of the detection, without the paths of model files.
             settings=asdict(settings) | {"detector": detected.settings["detector"] if detected else None},
-            inputs=_inputs(ingested, detected, background, measured),
+            inputs=inputs,
             force=force,
         )
         if run.finished:
@@ -253,7 +256,11 @@ def reconstruct(
         if disturbance is not None:
             every = [metrics, *(attempt.metrics for attempt in attempts)]
             metrics |= {"trials": summary_of_trials(every, disturbance.text, disturbance.seed)}
-            warnings.append(_disturbance_warning(disturbance))
+            draws = "a single draw" if disturbance.trials == 1 else f"trial 0 of {disturbance.trials}"
+            warnings.append(
+                f"the poses were disturbed by {disturbance.text}: the skeleton and the figures without"
+                f" `trials` are those of {draws} (seed {disturbance.seed}), not the flight's"
+            )
         _write_tables(run.folder, stored, gait, bodies)
         metrics = write_figures(run.folder, jsonable(metrics))
         warnings += [*stored.warnings, *_unused_cameras(flight.cameras, stored.result)]
@@ -295,15 +302,6 @@ def _detected(
     return detected
 
 
-def _inputs(
-    ingested: StageRecord, detected: StageRecord | None, background: StageRecord | None, measured: Path | None
-) -> dict[str, str]:
-    """The hashes of what is read: tables, hints of the detector, and how its confidences were measured."""
-    inputs = dict(ingested.outputs) | (detected.outputs | hints_from(detected) if detected else {})
-    inputs |= background.outputs if background else {}
-    return inputs if measured is None else inputs | {"calibration of confidences": sha256_of(measured)}
-
-
 def _hint_warnings(
     description: Description, ingested: StageRecord, detected: StageRecord | None
 ) -> list[str]:
@@ -323,14 +321,6 @@ def _check_fill(fill_s: float | None) -> None:
         problem = f"max_s: {fill_s:g} s is not between 0 and {_LONGEST_FILL_S:g} s"
         remedy = "a longer gap is no measurement: leave it open"
         raise DataError("--smooth", problem, remedy, code="bad-value")
-
-
-def _disturbance_warning(disturbance: PoseDisturbance) -> str:
-    draws = "a single draw" if disturbance.trials == 1 else f"trial 0 of {disturbance.trials}"
-    return (
-        f"the poses were disturbed by {disturbance.text}: the skeleton and the figures without `trials`"
-        f" are those of {draws} (seed {disturbance.seed}), not the flight's"
-    )
 
 
 def _followed(
@@ -356,15 +346,10 @@ def _followed(
             progress=progress,
         )
     except DataError as error:
-        return None, _reason(error, settings)
+        if settings.refine_cameras is not None or error.code == "changed":
+            raise
+        return None, f"{Path(error.source).name} {error.problem}"
     return record, None
-
-
-def _reason(error: DataError, settings: ReconstructSettings) -> str:
-    """Return why `auto` goes without backgrounds; raise it where they were asked for, or pictures changed."""
-    if settings.refine_cameras is not None or error.code == "changed":
-        raise error
-    return f"{Path(error.source).name} {error.problem}"
 
 
 def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> None:

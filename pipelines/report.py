@@ -358,10 +358,7 @@ class _Shown:
     def about(self, name: str, schema: pa.Schema) -> pd.DataFrame:
         """Read the rows of a table of other times that lie next to these."""
         path = self._folder / name
-        if self.every == 1:
-            return read_table(path, schema)
-        stamps = distinct(path, "t_ns")
-        if not len(stamps):
+        if self.every == 1 or not len(stamps := distinct(path, "t_ns")):
             return read_table(path, schema)
         after = np.searchsorted(stamps, self._t_ns).clip(0, len(stamps) - 1)
         next_to = np.concatenate([after, (after - 1).clip(0), (0, len(stamps) - 1)])
@@ -406,17 +403,9 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
     metrics = read_json(folder / "reconstruct" / "metrics.json") if reconstructed else None
     rows = count_rows(folder / "reconstruct" / "skeleton.parquet") if reconstructed else 0
     shown = _Shown(folder, _times(folder, description, reconstructed=reconstructed), rows, metrics)
-    keypoints = {
-        name: shown.keypoints("cameras", name)
-        for name, entry in description.cameras.items()
-        if entry.keypoints
-    }
-    if "detect" in records:
-        keypoints |= {
-            name: shown.keypoints("detect", name)
-            for name in records["detect"].counts["cameras"]
-            if name not in keypoints
-        }
+    found_by = {name: "cameras" for name, entry in description.cameras.items() if entry.keypoints}
+    detected = records["detect"].counts["cameras"] if "detect" in records else ()
+    found_by |= {name: "detect" for name in detected if name not in found_by}
     outputs = records["reconstruct"].outputs if reconstructed else {}
     angles, errors = "reconstruct/angles.parquet", "reconstruct/joint_errors.parquet"
     maps = load_maps(folder) if description.map else []
@@ -429,7 +418,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         truth=shown.about("truth.parquet", TRUTH) if description.has_true_joints else None,
         poses={name: shown.about(f"cameras/{name}/poses.parquet", POSES) for name in description.cameras},
         frames={name: shown.frames(name) for name in description.cameras},
-        keypoints=keypoints,
+        keypoints={name: shown.keypoints(stage, name) for name, stage in found_by.items()},
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
         refined=_by_camera(shown, "reconstruct/cameras.parquet", records.get("reconstruct")),

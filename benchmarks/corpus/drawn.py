@@ -41,7 +41,7 @@ from pipelines.session.camera_poses import noise_models
 from pipelines.session.maps import write_grid
 from pipelines.session.parallel import contents_of
 from pipelines.session.storage import write_json
-from pipelines.session.tables import KEYPOINTS, TRACKS, write_table
+from pipelines.session.tables import FRAMES, KEYPOINTS, TRACKS, read_table, write_table
 from pipelines.simulate import _planner
 from pipelines.simulation.flight import SimulatedFlight, fly_scenario
 from pipelines.simulation.flight_files import (
@@ -225,16 +225,17 @@ def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
     kept = read_keypoints(flight.keypoints_path(detector))
     backgrounds = read_backgrounds(flight) if flight.with_pictures else {}
 
-    def detect(work: Any, *others: Any) -> None:
-        block: DetectorBlock = others[-2]
-        folder: Path = others[-1]
-        frame, t_ns = work.frames(block)
-        table = kept.tables[block.camera]
-        table = table[table["frame"].isin(frame)]
-        times = t_ns[np.searchsorted(frame, table["frame"].to_numpy())]
-        write_table(folder / "keypoints.parquet", table.assign(t_ns=times), KEYPOINTS)
+    def detect(order: Any) -> dict[str, bytes]:
+        block: DetectorBlock = order.block
+        listed = read_table(order.session.opened() / f"cameras/{block.camera}/frames.parquet", FRAMES)
+        listed = listed.iloc[block.first : block.stop]
+        seen = listed[listed.index % order.every == 0]
+        table = kept.tables[block.camera].merge(seen[["frame", "t_ns"]], on="frame")
         counts = kept.counts[block.camera] if not block.first else dict.fromkeys(kept.counts[block.camera], 0)
-        write_json(folder / "counts.json", {"joints": list(kept.joints), "counts": counts})
+        with TemporaryDirectory() as place:
+            write_table(Path(place) / "keypoints.parquet", table, KEYPOINTS)
+            write_json(Path(place) / "counts.json", {"joints": list(kept.joints), "counts": counts})
+            return contents_of(Path(place))
 
     def follow(order: tuple[Any, FollowedBlock]) -> dict[str, bytes]:
         _, block = order
@@ -250,7 +251,7 @@ def kept_in_place_of_pictures(flight: Flight, detector: str) -> Iterator[None]:
             return contents_of(Path(place)) | stills
 
     with (
-        patch("pipelines.detect._produce", detect),
+        patch("pipelines.detect.detect_block", detect),
         patch("pipelines.detect.hashes_of_models", lambda _: {}),
         patch("pipelines.detect.follow_block", follow),
     ):

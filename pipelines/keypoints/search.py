@@ -111,7 +111,7 @@ def actor_hints(
     """
     position, quaternion = poses_at(trajectory, t_ns, between, static=entry.poses.static)
     sigma = hint_sigma(name, entry, trajectory, t_ns)
-    intrinsics = entry.intrinsics.intrinsics()
+    intrinsics = entry.intrinsics
     return [
         project_actor(at, (centre, turned), intrinsics, sigma_m=float(off_m), sigma_rad=float(off_rad))
         if np.isfinite(at).all() and np.isfinite(centre).all()

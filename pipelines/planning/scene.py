@@ -353,7 +353,7 @@ def _cameras(
         cameras.append(
             SessionCamera(
                 name=name,
-                intrinsics=entry.intrinsics.intrinsics(),
+                intrinsics=entry.intrinsics,
                 trajectory=true_poses.get(name, logged) if not entry.poses.static else logged,
                 static=entry.poses.static,
                 noise=noise,

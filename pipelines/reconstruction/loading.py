@@ -155,7 +155,7 @@ def _load_camera(
     frame, every = frames["frame"].to_numpy(np.int64), source.looked_at.step or 1
     return Camera(
         name=name,
-        intrinsics=entry.intrinsics.intrinsics(),
+        intrinsics=entry.intrinsics,
         frame_number=frame,
         frame_t_ns=frames["t_ns"].to_numpy(np.int64),
         follows=np.diff(frame, prepend=frame[0] - every) == every,

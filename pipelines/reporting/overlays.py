@@ -248,7 +248,7 @@ class FilmedCamera:
         entry = description.cameras[name]
         return cls(
             name=name,
-            intrinsics=entry.intrinsics.intrinsics(),
+            intrinsics=entry.intrinsics,
             frame=frames["frame"].to_numpy(np.int64),
             frame_t_ns=frames["t_ns"].to_numpy(np.int64),
             keypoints=keypoints[keypoints["confidence"] >= least],

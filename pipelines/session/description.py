@@ -6,13 +6,12 @@ Only ingest writes it. Every later stage reads it through this module and does n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pipelines.geometry.arrays import DistortionModel, Intrinsics, Place
+from pipelines.geometry.arrays import ClockFit, Intrinsics, Place
 from pipelines.session.errors import DataError
 from pipelines.session.records import HeldMap
 from pipelines.session.storage import hash_of, read_json, refuse_camera_names, refuse_newer
@@ -22,29 +21,6 @@ class Entry(BaseModel):
     """A mapping of session.json; unknown keys, which a later version added, are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, populate_by_name=True)
-
-
-class IntrinsicsEntry(Entry):
-    """`geometry.arrays.Intrinsics`, as it is stored."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    model: DistortionModel
-    distortion: tuple[float, ...]
-    readout_s: float
-
-    @classmethod
-    def of(cls, intrinsics: Intrinsics) -> IntrinsicsEntry:
-        """Return the entry of given intrinsics."""
-        return cls(**asdict(intrinsics))
-
-    def intrinsics(self) -> Intrinsics:
-        """Return the intrinsics of this entry."""
-        return Intrinsics(**self.model_dump())
 
 
 class FramesEntry(Entry):
@@ -140,19 +116,6 @@ class MediaEntry(Entry):
     stamps: str = "header"  # by which the log's pictures are ordered
 
 
-class LogClockEntry(Entry):
-    """Fit of a drone log's clock to UTC, from its GPS times; already applied to the tables."""
-
-    at_ns: int  # the log's own clock, in the middle of the fixes
-    offset_ns: int  # UTC minus the log's clock, at `at_ns`
-    drift_ppm: float
-    drift_sigma_ppm: float
-    residual_s: float  # scatter of the fixes
-    events: int
-    rejected: int
-    steps_s: tuple[float, ...] = ()  # of the receiver's time, taken out so that its last times count
-
-
 class OriginEntry(Entry):
     """Place on Earth of the world's origin; all cameras with positions on Earth share it."""
 
@@ -184,12 +147,12 @@ class PictureMapEntry(Entry):
 class CameraEntry(Entry):
     """One camera."""
 
-    intrinsics: IntrinsicsEntry
+    intrinsics: Intrinsics
     frames: FramesEntry
     poses: PosesEntry
     keypoints: KeypointsEntry | None
     clock: ClockEntry
-    log_clock: LogClockEntry | None = None
+    log_clock: ClockFit | None = None  # fit of a drone log's clock to UTC, already applied to the tables
     pose_noise: dict[str, dict[str, float | str]] | None
     media: MediaEntry | None
     picture_map: PictureMapEntry | None = None  # where `pose.attitude: pictures` is stated

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +81,8 @@ class FlightCameras:
         pictures = _pictures(video, logged)
         if times.fps is not None:
             count = len(pictures.t_ns) if pictures else self._listed_frames(camera, detections)
-            since_start = _ticks_ns(count, times.fps)
+            # Python's integers never overflow.
+            since_start = np.array([round(k * 10**9 / times.fps) for k in range(count)], dtype=np.int64)
             topic, lost = (pictures.topic, pictures.dropped) if pictures else (None, {})
             start_ns = self._start_ns(name, camera, times)
             return CameraFrames(np.arange(count), start_ns + since_start, since_start, topic, lost)
@@ -142,13 +142,7 @@ class FlightCameras:
             raise DataError(path, problem, "check that they belong together", code="clock-unknown")
         lost = Counter(pictures.dropped) + Counter(stamps.dropped)
         lost["without a time"] += int((~known).sum())
-        return replace(
-            pictures,
-            frame=pictures.frame[known],
-            t_ns=t_ns[known],
-            pts_ns=pictures.pts_ns[known],
-            dropped=dict(+lost),
-        )
+        return pictures.some(known, t_ns[known], lost)
 
     def _start_ns(self, name: str, camera: CameraSources, times: FrameTimes) -> int:
         """Return the start of a video that has stamps of its own."""
@@ -178,13 +172,7 @@ class FlightCameras:
         lost = Counter(pictures.dropped) + Counter(dropped)
         lost["without a stamp in the log"] += len(pictures.t_ns) - count
         lost["stamp in the log without a picture"] += len(t_ns) - count
-        return replace(
-            pictures,
-            frame=pictures.frame[:count],
-            t_ns=t_ns[:count],
-            pts_ns=pictures.pts_ns[:count],
-            dropped=dict(+lost),
-        )
+        return pictures.some(slice(count), t_ns[:count], lost)
 
     def media(self, camera: CameraSources, frames: CameraFrames, session: Path) -> MediaEntry | None:
         """Return the paths of the pictures relative to the session, which moves together with its flight."""
@@ -267,12 +255,6 @@ def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames |
         count = np.arange(len(since_start))
         return CameraFrames(count, logged.t_ns, since_start, logged.topic, logged.dropped)
     return None
-
-
-def _ticks_ns(count: int, fps: Fraction) -> Int64:
-    """Return the times of `count` frames from 0, each rounded to a ns; Python's integers never overflow."""
-    period = Fraction(1_000_000_000) / fps
-    return np.array([round(k * period) for k in range(count)], dtype=np.int64)
 
 
 def _made_ns(path: Path) -> int | None:

@@ -116,11 +116,8 @@ class FlightFiles:
 
     def keypoints(self, source: KeypointSource) -> tuple[Detections, str]:
         """Read the keypoints that the manifest gives for a camera; return them with their format's name."""
-        path, reader = self.path(source.file), self.format_of("keypoints", source)
-        if not isinstance(reader, KeypointFormat):
-            raise DataError(
-                path, f"{reader.name} is no keypoint format", "leave `format:` out", code="wrong-kind"
-            )
+        path = self.path(source.file)
+        reader = recognise(path, KeypointFormat, "keypoint file", name=source.format)
         skeleton = self.options("keypoints", source, DetectorOutput).skeleton
         detections = reader.read_keypoints(path, skeleton=skeleton, first_frame=source.first_frame)
         if not len(detections.frame):
@@ -146,9 +143,7 @@ class FlightFiles:
         """Return the camera that is asked for, or the one of this name, or the only one of the file."""
         path, camera = source.file, self.options(part, source, CameraOfCalibration).camera
         if path not in self._calibrations:
-            reader = self.format_of(part, source)
-            if not isinstance(reader, CalibrationFormat):
-                raise TypeError(f"{reader.name} reads no calibrations")
+            reader = recognise(self.path(path), CalibrationFormat, "calibration", name=source.format)
             self._calibrations[path] = reader.read_calibration(self.path(path))
         cameras = self._calibrations[path]
         if camera is None and name not in cameras and len(cameras) == 1:
@@ -265,19 +260,14 @@ def _without_far_joints(motion: JointMotion) -> JointMotion:
     """Set positions to NaN that are incomplete, or too far from the median of all to be true."""
     position = np.where(np.isfinite(motion.position).all(axis=-1, keepdims=True), motion.position, np.nan)
     known = position[~np.isnan(position[..., 0])]
-    if not len(known):
-        return replace(motion, position=position)
+    middle = np.median(known, axis=0) if len(known) else np.nan
     with np.errstate(over="ignore", invalid="ignore"):  # 1e308 is infinitely far from its negative
-        far = (np.abs(position - np.median(known, axis=0)) > MAX_JOINT_DISTANCE_M).any(axis=-1)
+        far = np.asarray((np.abs(position - middle) > MAX_JOINT_DISTANCE_M).any(axis=-1))
         far |= (np.abs(position) > MAX_COORDINATE_M).any(axis=-1)
-    if not far.any():
-        return replace(motion, position=position)
     cause = f"position more than {MAX_JOINT_DISTANCE_M // 1000} km from the others"
-    return replace(
-        motion,
-        position=np.where(far[..., None], np.nan, position),
-        dropped=motion.dropped | {cause: int(far.sum())},
-    )
+    lost = {cause: int(far.sum())} if far.any() else {}
+    position = np.where(far[..., None], np.nan, position)
+    return replace(motion, position=position, dropped=motion.dropped | lost)
 
 
 # A body that few joints stand for may be of any size.

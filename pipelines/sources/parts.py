@@ -1,13 +1,14 @@
 """Parts of a flight as they were read, and as a session stores them: tables, entries, doubts."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
-from pipelines.geometry.arrays import ClockFit, Int64, Intrinsics
+from pipelines.geometry.arrays import Bool, ClockFit, Int64, Intrinsics
 from pipelines.geometry.poses import gaps
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import (
@@ -15,9 +16,7 @@ from pipelines.session.description import (
     ClockEntry,
     FramesEntry,
     Interpolation,
-    IntrinsicsEntry,
     KeypointsEntry,
-    LogClockEntry,
     MediaEntry,
     MountEntry,
     PictureMapEntry,
@@ -56,6 +55,11 @@ class CameraFrames:
     pts_ns: Int64  # [F] since the first picture of the video
     topic: str | None = None  # the topic of the log that holds the pictures themselves
     dropped: dict[str, int] = field(default_factory=dict)  # pictures that were left out, by cause
+
+    def some(self, which: Bool | slice, t_ns: Int64, lost: Counter[str]) -> Self:
+        """Return some of the frames at other times, with all losses."""
+        frame, pts_ns = self.frame[which], self.pts_ns[which]
+        return replace(self, frame=frame, t_ns=t_ns, pts_ns=pts_ns, dropped=dict(+lost))
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ def camera_entry(
     """
     frames = data.frames
     entry = CameraEntry(
-        intrinsics=IntrinsicsEntry.of(data.intrinsics),
+        intrinsics=data.intrinsics,
         frames=FramesEntry(
             count=len(frames.t_ns),
             first_t_ns=int(frames.t_ns[0]),
@@ -117,7 +121,7 @@ def camera_entry(
             sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
             start=_clock_start(camera, frames),
         ),
-        log_clock=LogClockEntry(**asdict(data.log_clock)) if data.log_clock else None,
+        log_clock=data.log_clock,
         pose_noise=data.pose_noise,
         media=data.media,
         picture_map=data.picture_map,

@@ -5,13 +5,14 @@ They are joined here, in ENU axes about one origin on Earth.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.positions import FIXES, read_pair, read_positions
 from pipelines.formats.maps.voxel_grids import placed
@@ -271,14 +272,12 @@ class FlightPoses:
         return turned if any(stated) else in_world(turned, self._upright)
 
     def _filed_trajectory(self, pose: PoseSource) -> Trajectory:
-        path, reader = self._files.path(pose.file), self._files.format_of("pose", pose)
-        if not isinstance(reader, TrajectoryFormat):
-            raise TypeError(f"{reader.name} reads no trajectories")
+        path = self._files.path(pose.file)
+        reader = recognise(path, TrajectoryFormat, "trajectory", name=pose.format)
         trajectory = reader.read_trajectory(path)
         if not len(trajectory.t_ns):
-            raise DataError(
-                path, f"holds no usable pose ({losses(trajectory.dropped)})", "mend the log", code="no-poses"
-            )
+            problem = f"holds no usable pose ({losses(trajectory.dropped)})"
+            raise DataError(path, problem, "mend the log", code="no-poses")
         return trajectory
 
     def _mounted(self, name: str, mount: Mount | None) -> tuple[Float, Float]:
@@ -361,9 +360,7 @@ class FlightPoses:
         """Read the camera's attitudes from a log whose positions are not used."""
         stated = gimbal.file
         path, place = self._one_file(stated), f"{self._manifest}: cameras.{name}.gimbal"
-        reader = self._files.format_of("gimbal", gimbal)
-        if not isinstance(reader, AttitudeFormat):
-            raise TypeError(f"{reader.name} reads no attitudes")
+        reader = recognise(path, AttitudeFormat, "source of angles", name=gimbal.format)
         found = reader.read_attitudes(path)
         if gimbal.yaw_deg is not None:
             problem = "yaw_deg: the angles of this file know where north is"
@@ -424,7 +421,11 @@ class FlightPoses:
             grid = replace(grid, origin=scale * grid.origin, resolution_m=scale * grid.resolution_m)
             grid = placed(str(source), grid, (np.zeros(3), turn_of(self._upright)))
         stated = Projection(crs, f"{self._manifest}: map.crs") if crs else None
-        own = self._own_crs(source, grid) if grid.crs and origin is not None else None
+        own = None
+        if grid.crs and origin is not None:
+            own = Projection(grid.crs, str(source)) if is_usable(grid.crs) else None
+            if own is None:
+                self._note(f"{source}: its own CRS is not used: it is no projected or geographic one")
         projection = stated or own or self._projection
         if own is not None and stated is None:
             self._note(f"{source}: placed on Earth by the CRS in it, {own.name}")
@@ -443,13 +444,6 @@ class FlightPoses:
                 )
         self.refuse_projected(source, grid.origin[None], projection)
         return grid
-
-    def _own_crs(self, source: Path, grid: Occupancy) -> Projection | None:
-        """Return the CRS that a map's file names; None, with a note, if it places nothing on Earth."""
-        if grid.crs and is_usable(grid.crs):
-            return Projection(grid.crs, str(source))
-        self._note(f"{source}: its own CRS is not used: it is no projected or geographic one")
-        return None
 
     def _compare_crs(
         self, source: Path, grid: Occupancy, stated: Projection, own: Projection, origin: Place
@@ -670,7 +664,9 @@ class FlightPoses:
         track, body = telemetry.position, telemetry.body
         values, turn = self._in_world(name, track)
         self._doubt(name, track)
-        t_ns = _fastest(track.t_ns, [part.t_ns for part in (gimbal or body,) if part is not None])
+        # The stamps with the highest rate; positions win a tie.
+        others = [part.t_ns for part in (gimbal or body,) if part is not None]
+        t_ns = min([track.t_ns, *others], key=lambda stamps: median_step_ns(stamps) or np.inf)
         position = interpolate_points(track.t_ns, values, t_ns, max_gap_ns=self._max_gap_ns)
         if body is not None:
             quaternion = self._at(body, t_ns)
@@ -764,7 +760,7 @@ class FlightPoses:
     def _doubt(self, name: str, track: PositionTrack) -> None:
         if len(track.t_ns) < 2:
             return
-        step_s = float(np.median(np.diff(track.t_ns))) / 1e9
+        step_s = (median_step_ns(track.t_ns) or 0.0) / 1e9
         if step_s * 1e9 > self._max_gap_ns:
             self._note(
                 f"{name}: {track.name} comes every {step_s:.3g} s, further apart than what is bridged"
@@ -793,12 +789,3 @@ def _turned_as_named(place: str, source: str, track: AttitudeTrack, gimbal: Gimb
 def _first_place(track: PositionTrack) -> Place:
     latitude, longitude, height = track.values[0].tolist()
     return Place(latitude, longitude, 0.0 if track.height in _ABOVE_TAKE_OFF else height)
-
-
-def _fastest(position_t_ns: Int64, others: Sequence[Int64]) -> Int64:
-    """Return the stamps with the highest rate; positions win a tie."""
-
-    def step(t_ns: Int64) -> float:
-        return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf
-
-    return min([position_t_ns, *others], key=step)

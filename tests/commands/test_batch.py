@@ -97,7 +97,7 @@ def test_a_session_at_a_url_is_uploaded_when_its_flight_is_done(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     flight = write_flight(tmp_path, seconds=0.4)
     (tmp_path / "store").mkdir()
-    settings = BatchSettings(stages=("ingest", "reconstruct"), method="dlt")
+    settings = BatchSettings(("ingest", "reconstruct"), ReconstructSettings("dlt"))
     job = Job(flight.manifest, Path(f"file://{tmp_path}/store/flight.session"), settings, force=False)
     assert run_flight(job).error is None
     assert (tmp_path / "store" / "flight.session" / "reconstruct" / "skeleton.parquet").is_file()

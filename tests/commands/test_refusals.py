@@ -236,7 +236,7 @@ def test_an_inline_fisheye_without_distortion_is_equidistant(flight: SyntheticFl
     del inline["distortion"]
     flight.save()
     succeeds("ingest", flight.manifest)
-    lens = read_description(tmp_path / "flight.session").cameras["drone1"].intrinsics.intrinsics()
+    lens = read_description(tmp_path / "flight.session").cameras["drone1"].intrinsics
     # 45 degrees to the side: r = f theta, where a pinhole has f tan(theta).
     pixel = project(np.array([1.0, 0.0, 1.0]), lens)
     np.testing.assert_allclose(pixel, [640 + 300 * np.pi / 4, 360])

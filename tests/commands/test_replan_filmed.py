@@ -106,7 +106,7 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
     assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
     truth = read_motion(session / "truth.parquet", TRUTH)
     joints = truth.position  # [T, P, J, 3]
-    lens = read_description(session).cameras["drone1"].intrinsics.intrinsics()
+    lens = read_description(session).cameras["drone1"].intrinsics
     rendered, shown = [], []
 
     def picture(

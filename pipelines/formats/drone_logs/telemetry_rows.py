@@ -110,14 +110,7 @@ def position_track(
         raise DataError(source, problem, "name another log", code="no-positions")
     for cause, count in found.items():
         dropped[cause] = dropped.get(cause, 0) + count
-    return PositionTrack(
-        name=name,
-        t_ns=t_ns[keep],
-        values=values[keep],
-        on_earth=on_earth,
-        height=height,
-        origin=origin,
-    )
+    return PositionTrack(name, t_ns[keep], values[keep], on_earth, height, origin)
 
 
 def require_position(
@@ -141,12 +134,7 @@ def attitude_track(
 ) -> AttitudeTrack | None:
     """Drop the attitudes that cannot be used, counted as "attitude ..."; return None if none is left.
 
-    Args:
-        name: name of the attitude in the log.
-        t_ns: [N] stamps.
-        quaternion_xyzw: [N, 4] of an FLU body or gimbal in an ENU world.
-        dropped: receives the counts.
-        stated: of a gimbal, its angles as the log gives them, as in `AttitudeTrack`.
+    `quaternion_xyzw` [N, 4] are of an FLU body or gimbal in an ENU world; `stated` as in `AttitudeTrack`.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quaternion_xyzw, axis=1)
@@ -199,7 +187,6 @@ def pictures_on_gps_time(source: Path, t_ns: Int64, fit: ClockFit | None, choice
 def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:
     """Return attitudes [N, 4] of an FLU gimbal in an ENU world, from angles with yaw relative to the nose.
 
-    Autopilots log such angles: pitch and roll against the horizon, yaw against the heading. So
     `heading_from_gimbal` [N, 4] is an FRD gimbal in a level frame with x along the nose and z down. NaN if
     the body's attitude is not known within a second.
     """
@@ -277,14 +264,9 @@ class Boots:
 def find_boots(
     boot_ns: Int64, places: Int64, clock_boot_ns: Int64, clock_ns: Int64, clock_places: Int64
 ) -> Boots:
-    """Find the restarts of an autopilot.
+    """Find the restarts of an autopilot by times since boot [N] of frequent messages, and their places.
 
-    Args:
-        boot_ns: [N] times since boot of frequent messages, in the order of the log.
-        places: [N] where they are.
-        clock_boot_ns: [M] the same of messages that also state the time of another clock.
-        clock_ns: [M] that time.
-        clock_places: [M] where they are.
+    `clock_boot_ns`, `clock_ns` and `clock_places` [M] are of messages that also state another clock's time.
     """
     starts = []
     for k in (np.flatnonzero(np.diff(boot_ns) < -_RESTART_NS) + 1).tolist():
@@ -349,10 +331,7 @@ def on_gps_time(
 def refuse_marks(path: Path, *marks: bytes, most: int | None = None) -> None:
     """Refuse a log with more beginnings of messages than messages fit into it: a parser tries each of them.
 
-    Args:
-        path: the log.
-        marks: bytes with which messages begin.
-        most: number that no recorder exceeds; by default 100,000, or one for eight bytes if that is more.
+    `most` is by default 100,000, or one for eight bytes if that is more.
     """
     size = path.stat().st_size
     if size < _FEW_MARKS:
@@ -394,11 +373,10 @@ def between_repeats(t_ns: Int64, values: Float) -> tuple[Float, int]:
 def between_refreshed_angles(t_ns: Int64, angles: Float) -> Float:
     """Interpolate the angles [N, D] of a log that repeats each measurement until the next one comes.
 
-    A gimbal that keeps an angle gives the same number at each measurement. So an angle counts as repeated
-    only for one refresh interval of the log: of a longer hold, only the last interval becomes a line to the
-    new angle. The refresh interval is the shortest time between two changes, because a log that repeats
-    cannot change sooner. It is used only if most changes follow each other so soon. Angles have no jumps by
-    full turns; each column may be refreshed at its own rate.
+    A gimbal that keeps an angle gives the same number at each measurement. So of a longer hold, only the last
+    refresh interval becomes a line to the new angle. That is the shortest time between two changes, if most
+    follow each other so soon. Angles have no jumps by full turns; each column may be refreshed at its own
+    rate.
     """
     return np.stack([_between_changes(t_ns, column, _refreshed_rows(column)) for column in angles.T], axis=1)
 
