@@ -6,13 +6,7 @@ from typing import Any
 
 import click
 
-from mocap_cli.options import (
-    FiniteRange,
-    Shown,
-    any_path,
-    output_options,
-    overwrite_option,
-)
+from mocap_cli.options import FiniteRange, Shown, any_path, output_options, overwrite_option
 from mocap_cli.several import each
 from mocap_cli.terminal import say, watching
 

@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mocap_cli.options import (
-    FiniteRange,
-    Shown,
-    any_place,
-    force_option,
-    output_options,
-    overwrite_option,
-)
+from mocap_cli.options import FiniteRange, Shown, any_place, force_option, output_options, overwrite_option
 from mocap_cli.several import each
 from mocap_cli.terminal import one_line, print_table, say, say_warnings, watching
 

@@ -6,13 +6,7 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import (
-    Shown,
-    any_path,
-    example_option,
-    output_options,
-    overwrite_option,
-)
+from mocap_cli.options import Shown, any_path, example_option, output_options, overwrite_option
 from mocap_cli.terminal import one_line, print_json, say, watching
 
 # More files of one kind in one folder are counted instead of listed.

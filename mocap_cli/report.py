@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mocap_cli.options import (
-    Shown,
-    any_path,
-    any_place,
-    force_option,
-    output_options,
-    overwrite_option,
-)
+from mocap_cli.options import Shown, any_path, any_place, force_option, output_options, overwrite_option
 from mocap_cli.several import end, expanded, tell
 from mocap_cli.terminal import print_json, say, say_warnings, watching
 from pipelines.session.errors import MocapError

@@ -12,14 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipelines.detect import (
-    BACKGROUND,
-    DETECT,
-    cameras_to_detect,
-    cameras_to_follow,
-    detect,
-    follow,
-)
+from pipelines.detect import BACKGROUND, DETECT, cameras_to_detect, cameras_to_follow, detect, follow
 from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
 from pipelines.reconstruction.background_tracks import Followed, load_tracks

@@ -35,12 +35,7 @@ from pipelines.session.parallel import SharedSession, contents_of, each_part, wr
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Detections
-from pipelines.session.registries import (
-    Detector,
-    KeypointNetworks,
-    find_detector,
-    hashes_of_models,
-)
+from pipelines.session.registries import Detector, KeypointNetworks, find_detector, hashes_of_models
 from pipelines.session.stages import Run, Stage, StageRecord, WritableSession
 from pipelines.session.storage import hash_of, read_json, write_json
 from pipelines.session.tables import (

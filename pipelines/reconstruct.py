@@ -28,13 +28,7 @@ from pipelines.keypoints.corrections import (
 )
 from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
-from pipelines.reconstruction.bodies import (
-    body_figures,
-    body_parts,
-    fit_bodies,
-    load_true_bodies,
-    shape_rows,
-)
+from pipelines.reconstruction.bodies import body_figures, body_parts, fit_bodies, load_true_bodies, shape_rows
 from pipelines.reconstruction.body_fit import BodyFit
 from pipelines.reconstruction.clocks import (
     MIN_SIGMAS_TO_MOVE,

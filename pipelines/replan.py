@@ -47,12 +47,7 @@ from pipelines.session.parallel import return_freed_arrays, return_unused
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Stage, StageRecord, WritableSession, key_of, locked, usable_record
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
-from pipelines.session.tables import (
-    ACTOR,
-    REPLAN,
-    read_table,
-    write_table,
-)
+from pipelines.session.tables import ACTOR, REPLAN, read_table, write_table
 from pipelines.session.yaml_files import plain_yaml
 from pipelines.simulation.detector_errors import (
     ANY_JOINT,

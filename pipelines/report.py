@@ -14,13 +14,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
-from pipelines.reporting.content import (
-    ReplanContent,
-    SessionContent,
-    StudyContent,
-    estimated_clocks,
-    section,
-)
+from pipelines.reporting.content import ReplanContent, SessionContent, StudyContent, estimated_clocks, section
 from pipelines.reporting.page import draw_session, render_page
 from pipelines.reporting.pictures import Video
 from pipelines.reporting.session_comparison import compare, draw_comparison, labels_of, render_comparison

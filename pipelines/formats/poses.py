@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import file_names_of_people, safe_file_name, tracks_of
-from pipelines.formats.common.files import read_head
+from pipelines.formats.common.files import TextFormat
 from pipelines.formats.common.rows import (
     NANOSECONDS,
     NORM_TOLERANCE,
@@ -146,18 +146,10 @@ def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:
 
 
 @dataclass(frozen=True)
-class TrajectoryFile:
+class TrajectoryFile(TextFormat):
     """Reader of the poses of a text file: `is_known` recognises its beginning, `read` returns its poses."""
 
-    name: str
-    title: str
-    suffixes: tuple[str, ...]
-    is_known: Callable[[str], bool]
     read: Callable[[Path], Trajectory]
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if the file begins as such files do."""
-        return self.is_known(read_head(path, self.suffixes))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, gaps, bounding box and losses."""

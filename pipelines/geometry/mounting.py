@@ -9,12 +9,7 @@ from typing import Literal
 import numpy as np
 
 from pipelines.geometry.arrays import Float, RelativeTo
-from pipelines.geometry.poses import (
-    ENU_FROM_NED,
-    multiply,
-    quaternion_from_rotation_vector,
-    rotate,
-)
+from pipelines.geometry.poses import ENU_FROM_NED, multiply, quaternion_from_rotation_vector, rotate
 
 Pose = tuple[Float, Float]
 Looks = Literal["forward", "backward", "left", "right", "down", "up"]

@@ -22,11 +22,7 @@ from pipelines.formats.logs.maps import (
     read_maps,
 )
 from pipelines.formats.logs.messages import Kind, all_samples, kind_of
-from pipelines.formats.logs.pictures import (
-    decode,
-    later_times,
-    picture_stamps,
-)
+from pipelines.formats.logs.pictures import decode, later_times, picture_stamps
 from pipelines.formats.logs.positions import FIXES, axes_of_topic, pairs_of
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import (

@@ -18,11 +18,7 @@ from pipelines.formats.logs.positions import FIXES, read_pair, read_positions
 from pipelines.formats.maps.voxel_grids import placed
 from pipelines.geometry.arrays import ClockFit, Float, Int64, Place
 from pipelines.geometry.geodesy import enu_from_enu, enu_from_geodetic
-from pipelines.geometry.mounting import (
-    attitude_in_enu,
-    compose_gimbal,
-    level_heading,
-)
+from pipelines.geometry.mounting import attitude_in_enu, compose_gimbal, level_heading
 from pipelines.geometry.poses import (
     compose,
     interpolate_points,

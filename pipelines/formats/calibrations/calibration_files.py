@@ -18,7 +18,7 @@ from pipelines.formats.calibrations.camera_matrices import (
     invert_rodrigues,
     unstated_size,
 )
-from pipelines.formats.common.files import numbers, read_head, read_yaml
+from pipelines.formats.common.files import TextFormat, numbers, read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
@@ -33,18 +33,10 @@ _FISHEYE = {"equidistant", "fisheye"}
 
 
 @dataclass(frozen=True)
-class CalibrationFile:
+class CalibrationFile(TextFormat):
     """Reader of the cameras of a file: `is_known` recognises its beginning, `read` returns them by name."""
 
-    name: str
-    title: str
-    suffixes: tuple[str, ...]
-    is_known: Callable[[str], bool]
     read: Callable[[Path], Cameras]
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if the file begins as such files do."""
-        return self.is_known(read_head(path, self.suffixes))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe every camera."""

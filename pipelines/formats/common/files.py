@@ -1,7 +1,8 @@
 """Reading of whole files as bytes, text or YAML, and of their beginnings, by which formats are recognised."""
 
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -103,3 +104,17 @@ def read_head(path: Path, suffixes: Collection[str] = ()) -> str:
     head = first_bytes(path, suffixes=suffixes)
     text = plain_text(head)
     return text if len(head) < HEAD_BYTES else text.rpartition("\n")[0]
+
+
+@dataclass(frozen=True)
+class TextFormat:
+    """Base of readers of text: `is_known` recognises the beginning of such a file."""
+
+    name: str
+    title: str
+    suffixes: tuple[str, ...]
+    is_known: Callable[[str], bool]
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if the file begins as such files do."""
+        return self.is_known(read_head(path, self.suffixes))

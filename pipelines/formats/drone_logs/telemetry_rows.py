@@ -13,11 +13,7 @@ from pipelines.formats.common.rows import NORM_TOLERANCE, describe_times, kept_r
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place, RelativeTo
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_from_angles, attitude_in_enu, level_heading
-from pipelines.geometry.poses import (
-    interpolate_points,
-    interpolate_poses,
-    multiply,
-)
+from pipelines.geometry.poses import interpolate_points, interpolate_poses, multiply
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, Height, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice

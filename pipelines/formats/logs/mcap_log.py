@@ -14,13 +14,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
-from pipelines.formats.logs.recordings import (
-    CHUNK_LIMIT,
-    Channel,
-    Chunk,
-    ChunkedPart,
-    Content,
-)
+from pipelines.formats.logs.recordings import CHUNK_LIMIT, Channel, Chunk, ChunkedPart, Content
 from pipelines.formats.logs.trajectories import LogFile
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError

@@ -14,24 +14,11 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.logs.messages import (
-    Edge,
-    LoggedRows,
-    Source,
-    Stamps,
-    all_samples,
-    kind_of,
-    samples,
-)
+from pipelines.formats.logs.messages import Edge, LoggedRows, Source, Stamps, all_samples, kind_of, samples
 from pipelines.formats.logs.recordings import LogPart, OpenLog, begins_like, open_parts
 from pipelines.formats.poses import clean_poses
 from pipelines.geometry.arrays import Int64
-from pipelines.geometry.clocks import (
-    MAX_STEP_S,
-    StampGap,
-    find_gaps,
-    time_passed,
-)
+from pipelines.geometry.clocks import MAX_STEP_S, StampGap, find_gaps, time_passed
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.poses import Link, chain, continuous_signs, find_route, pose_covariance_in_body
 from pipelines.session.errors import DataError

@@ -13,13 +13,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Float32, Int64
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
-from pipelines.session.maps import (
-    MapSizeError,
-    check_resolution,
-    check_size,
-    describe_map,
-    read_grid,
-)
+from pipelines.session.maps import MapSizeError, check_resolution, check_size, describe_map, read_grid
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import empty
 

@@ -16,7 +16,7 @@ from pipelines.formats.common.exporting import (
     safe_file_name,
     tracks_of,
 )
-from pipelines.formats.common.files import read_head
+from pipelines.formats.common.files import TextFormat
 from pipelines.formats.common.rows import (
     SECONDS,
     Heading,
@@ -249,18 +249,10 @@ _FRAME_NAMES = ("sync_index", "frame")
 
 
 @dataclass(frozen=True)
-class JointFile:
+class JointFile(TextFormat):
     """Reader of joints in text: `is_known` recognises its beginning, `read` takes path, unit and axes."""
 
-    name: str
-    title: str
-    suffixes: tuple[str, ...]
-    is_known: Callable[[str], bool]
     read: Callable[[Path, str | None, str | None], JointMotion]
-
-    def recognises(self, path: Path) -> bool:
-        """Return True if the file begins as such files do."""
-        return self.is_known(read_head(path, self.suffixes))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe joints, people, times, missing values, and the box in the world (z up)."""
