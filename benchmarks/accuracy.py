@@ -18,8 +18,6 @@ for in the call alone whose time is taken. Results are kept in build/accuracy by
 the flight's files, so an interrupted run continues, and a changed program measures anew.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -12,8 +12,6 @@ Flights of 6 s move by some metres only, so many are refused with the errors of 
 Films stay in FOLDER.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Iterator
@@ -28,12 +26,7 @@ from benchmarks.results import markdown_table
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import Bias, GaussMarkov, NoiseModel, White, disturb, pose_errors
-from pipelines.geometry.poses import (
-    conjugate,
-    interpolate_poses,
-    multiply,
-    rotation_vector_from_quaternion,
-)
+from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rotation_vector_from_quaternion
 from pipelines.ingest import ingest
 from pipelines.reconstruction.picture_map import (
     NoAttitudesError,

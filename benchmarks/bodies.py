@@ -6,8 +6,6 @@ joint centres, "centres" those of the body; both relative to the middle of the h
 by the covariances in body.parquet.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from collections.abc import Iterator

@@ -6,8 +6,6 @@ spread the variation of a bone's length. The distance from Pose2Sim is the media
 have. Detection runs on one thread; its time is for one person in one picture.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time

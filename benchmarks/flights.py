@@ -1,7 +1,5 @@
 """Flights that several benchmarks share: the sample, the real recording, and scenarios of several people."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -28,8 +28,6 @@ FOLDER/PATH/NAME.yaml are flights that every command of `mocap` takes, FOLDER/PA
 poses. Set OPENBLAS_NUM_THREADS=1.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import time

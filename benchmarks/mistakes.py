@@ -18,8 +18,6 @@ With --corpus, the flights are those of `benchmarks.corpus`. They are checked as
 in the times of all pictures, which backgrounds alone can show. `--write` puts the counts into the results.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import tempfile

@@ -16,8 +16,6 @@ Switches, phantoms (times), MOTA, IDF1 and MPJPE (mm) are those of metrics.json.
 than 1 m from everybody.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

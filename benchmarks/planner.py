@@ -19,8 +19,6 @@ robots jump from cell to cell. groups: four drones, people who stand together, w
 `first` is `adaptive` with the weight of all others 0.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -9,8 +9,6 @@ Each part of the page is a table with the command that measured it, its date and
 `benchmarks` replace their parts with `--write`. The detector must be there (`mocap models fetch blazepose`).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -8,8 +8,6 @@ Everything is simulated, with modelled keypoints and no film. Each command of --
 own.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -13,8 +13,6 @@ another machine (2,250 frames of the same kind of walk, five cameras, true poses
     sample         the commands on the sample flight, with detection in all pictures
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,9 @@
 """Real recordings and networks that some tests use; where they cannot be had, those tests are skipped."""
 
+import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,6 +20,12 @@ def real_data(relative: str) -> Path:
     if not path.exists():
         pytest.skip(f"real recordings are not here ({relative}); set MOCAP_REAL_DATA to their folder")
     return path
+
+
+def facts(name: str) -> dict[str, Any]:
+    """Return what other programs found in a real input."""
+    found: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))[name]
+    return found
 
 
 def fetch_networks(detector: str) -> None:

@@ -7,8 +7,6 @@ that are in the folder. A film is removed once all of its flight is kept, unless
 must be there (`mocap models fetch`), and the recorded motions (MOCAP_REAL_DATA).
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import time

@@ -5,8 +5,6 @@ other. The stages `detect` and the background's following find what is kept in t
 videos are grey.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

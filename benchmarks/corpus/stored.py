@@ -6,8 +6,6 @@ stills. Pixels are rounded (0.1 px for keypoints, 0.05 px for tracks).
 Everything else is made again from the scenario in seconds (`benchmarks.corpus.drawn`).
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping, Sequence

@@ -147,16 +147,16 @@ class Meddler(Silent):
             self._what()
 
 
-@pytest.mark.parametrize("steps", [FRAMES + 3])
+@pytest.mark.parametrize(("steps", "name"), [(FRAMES + 3, "right.mp4"), (2 * FRAMES + 3, "left.mp4")])
 def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(
-    flight: Path, steps: int, monkeypatch: pytest.MonkeyPatch
+    flight: Path, steps: int, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(detect, "BLOCK", FRAMES // 2)
-    session, video = flight / "flight.session", flight / ("left.mp4" if steps < FRAMES else "right.mp4")
+    session, video = flight / "flight.session", flight / name
     settings = ReconstructSettings(detector=spot_detector(flight))
     reconstruct(session, settings)
     expected = content(session)
-    assert any(name.startswith("background/left/") for name in expected), "the camera that moves is followed"
+    assert any(file.startswith("background/left/") for file in expected), "the camera that moves is followed"
     shutil.copy2(video, flight / "kept.mp4")
     for stage in ("detect", "background"):
         shutil.rmtree(session / stage)

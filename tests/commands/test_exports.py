@@ -8,7 +8,7 @@ import pytest
 from filelock import FileLock
 from rosbags.highlevel import AnyReader
 
-from pipelines.export import export, load_recording
+from pipelines.export import export
 from pipelines.formats.skeletons import c3d, joint_files, trc
 from pipelines.formats.skeletons.joint_files import at_even_times, write_sto
 from pipelines.geometry.joint_angles import ANGLES
@@ -80,17 +80,6 @@ def test_a_session_without_a_skeleton_gives_the_cameras_and_says_so(tmp_path: Pa
     files = read_json(tmp_path / "flight.export" / RECORD)["files"]
     assert all(len(facts["notes"]) == 1 for facts in files.values())
     assert refused("export", tmp_path / "flight.session", "--to", "trc").count("mocap reconstruct") == 1
-
-
-def test_pictures_lie_where_the_skeleton_does(filmed: Path) -> None:
-    recording = load_recording(filmed, pictures_hz=5.0)
-    plain, drawn = dict(recording.pictures("drone2")), dict(recording.overlays("drone2"))
-    # The first frame of every 0.2 s.
-    assert list(plain) == list(drawn) == [START_NS + ms * 1_000_000 for ms in (0, 217, 400)]
-    for stamp, picture in drawn.items():
-        changed = np.abs(picture.astype(int) - plain[stamp]).max(axis=2) > 40
-        assert 500 < changed.sum() < changed.size / 10  # bones, joints and the caption
-    assert not dict(load_recording(filmed).overlays("drone2")), "none unless they are asked for"
 
 
 def test_what_a_killed_export_left_goes_and_a_second_one_at_once_is_refused(

@@ -1,6 +1,5 @@
 """Stage `background`: what it keeps, what it depends on, and the binding of its blocks."""
 
-import shutil
 from pathlib import Path
 
 import cv2
@@ -11,14 +10,11 @@ import pytest
 from pipelines import detect
 from pipelines.detect import follow
 from pipelines.geometry.arrays import Picture
-from pipelines.reconstruct import reconstruct
 from pipelines.reconstruction.background_tracks import load_stills, load_tracks
 from pipelines.reconstruction.loading import load_cameras
 from pipelines.session.description import read_description
 from pipelines.session.stages import locked
-from tests.commands.runner import content, succeeds
-from tests.commands.test_changed_files import Meddler, mirror
-from tests.raising import refused
+from tests.commands.runner import succeeds
 from tests.synthetic.flights import LENS, write_flight
 from tests.synthetic.videos import even_ticks, write_video
 
@@ -67,23 +63,6 @@ def test_tracks_and_stills_are_kept_for_other_methods_and_poses(session: Path) -
     assert found is not None
     pictures = np.concatenate([part.picture for part in found.between(0, FRAMES)])
     assert set(pictures.tolist()) == set(range(FRAMES))
-
-
-def test_a_video_that_is_exchanged_while_it_is_followed_is_refused(
-    session: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing of it is kept: with the right video, the result is that of a flight where nothing happened."""
-    monkeypatch.setattr(detect, "BLOCK", 15)
-    reconstruct(session)
-    expected = content(session)
-    video = session.parent / "drone1.mp4"
-    shutil.copy2(video, session.parent / "kept.mp4")
-    shutil.rmtree(session / "background")
-    with refused("changed"):
-        reconstruct(session, progress=Meddler(FRAMES // 2, lambda: mirror(video)))
-    shutil.copy2(session.parent / "kept.mp4", video)
-    reconstruct(session)
-    assert content(session) == expected
 
 
 def test_blocks_share_a_picture_and_no_points(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:

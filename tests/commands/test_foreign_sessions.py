@@ -195,34 +195,3 @@ def test_ctrl_c_while_modules_are_loaded_is_one_line(session: Path, module: str)
     done = subprocess.run(program, capture_output=True, text=True, check=False)
     assert done.returncode == 130
     assert len(done.stderr.strip().splitlines()) == 1
-
-
-def test_a_closed_stderr_changes_nothing(session: Path) -> None:
-    def run(arguments: str) -> subprocess.CompletedProcess[str]:
-        command = f"exec {MOCAP} {arguments} 2>&-"
-        return subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
-
-    assert run(f"info {session}").returncode == 0
-    assert run(f"info {session}/none").returncode == 1
-    assert run(f"export {session} --to csv").returncode == 0
-
-
-def test_linear_algebra_has_one_thread_whatever_is_set(session: Path) -> None:
-    program = "import os, pipelines; print(os.environ['OPENBLAS_NUM_THREADS'])"
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "4"}
-    python = Path(MOCAP).with_name("python")
-    done = subprocess.run([python, "-c", program], env=environment, capture_output=True, check=True)
-    assert done.stdout.strip() == b"1"
-
-
-@pytest.mark.parametrize("change", ["clock", "pose_noise", "intrinsics"])
-def test_true_is_no_number(tmp_path: Path, change: str) -> None:
-    flight = write_flight(tmp_path, seconds=0.1)
-    value: dict[str, object] = {
-        "clock": {"sigma_s": True},
-        "pose_noise": {"white": {"position_m": True, "rotation_deg": 0.1}},
-        "intrinsics": {"width": 10, "height": 10, "fx": True, "fy": 1, "cx": 5, "cy": 5},
-    }
-    flight.settings["cameras"]["drone1"][change] = value[change]
-    flight.save()
-    assert f"cameras.drone1.{change}" in refused("ingest", flight.manifest, code="bad-value")

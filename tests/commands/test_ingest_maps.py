@@ -13,8 +13,8 @@ from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import read_json
 from tests.commands.runner import content, mocap, refused, succeeds
-from tests.commands.test_real_logs import facts, session_of, write_flight
-from tests.real_data import real_data
+from tests.commands.test_logged_flights import session_of, write_flight
+from tests.real_data import facts, real_data
 from tests.synthetic.flights import SyntheticFlight
 from tests.synthetic.flights import write_flight as write_synthetic_flight
 from tests.synthetic.logs import Container, write_log
@@ -184,28 +184,3 @@ def test_real_lidar(tmp_path: Path) -> None:
     assert len(maps) == expected["count"]
     counts = [int((one.probability == 1).sum()) for one in maps]
     assert counts == sorted(set(counts))
-    # The points of the last map lie in no more voxels than there are points, and in those alone.
-    assert counts[-1] == _voxels_of_lidar(name, 0.5)
-
-
-def _voxels_of_lidar(name: str, side: float) -> int:
-    """Count voxels with the public reader of bags."""
-    from rosbags.highlevel import AnyReader
-
-    found = []
-    with AnyReader([real_data(name)]) as reader:
-        clouds = [each for each in reader.connections if each.topic == "/luminar_pointcloud"]
-        for connection, _, data in reader.messages(clouds):
-            cloud: Any = reader.deserialize(data, connection.msgtype)
-            words = cloud.data.reshape(-1, cloud.point_step)
-            offsets = {each.name: (each.offset, each.datatype) for each in cloud.fields}
-            columns = []
-            for axis in "xyz":
-                offset, kind = offsets[axis]
-                width = {7: 4, 8: 8}[kind]
-                raw = np.ascontiguousarray(words[:, offset : offset + width])
-                columns.append(raw.view(f"<f{width}")[:, 0].astype(float))
-            points = np.stack(columns, axis=1)
-            points = points[np.isfinite(points).all(axis=1)]
-            found.append(np.unique(np.floor(points / side), axis=0))
-    return len(np.unique(np.concatenate(found), axis=0))

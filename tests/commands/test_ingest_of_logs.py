@@ -1,17 +1,23 @@
-"""Ingest of logs: it opens each log once, always closes it, and needs no more memory for a longer one."""
+"""Ingest: it opens each log once, needs bounded memory, and takes sizes from the pictures."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import LogFile
+from pipelines.geometry.cameras import camera_matrix
 from pipelines.ingest import ingest
+from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.sources.logs import FlightLogs
+from tests.commands.runner import ingested as session_of
+from tests.commands.runner import refused
+from tests.synthetic.flights import LENS, write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 from tests.synthetic.logs import Entry, write_log
 from tests.synthetic.recorder_logs import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
@@ -103,3 +109,32 @@ def test_memory_is_bounded(tmp_path: Path, container: str) -> None:
     peaks = [in_a_process(timed, ingested, tiny, log)["peak_mb"] for log in (small, large)]
     assert max(peaks) < 400
     assert peaks[1] - peaks[0] < 15
+
+
+SIZE = [LENS.width, LENS.height]
+
+
+def _store(path: Path, matrix: np.ndarray) -> None:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", matrix)
+    storage.write("distortion_coefficients", np.array([LENS.distortion or [0.0] * 5]))
+    storage.release()
+
+
+def test_a_calibration_without_a_size_takes_that_of_the_pictures(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, clean=True, seconds=0.2)
+    camera = flight.settings["cameras"]["drone1"]
+    _store(tmp_path / "camera.yaml", camera_matrix(LENS))
+    camera["intrinsics"] = {"file": "camera.yaml"}
+    flight.save()
+    refused("ingest", flight.manifest)  # neither the calibration nor the keypoints have a size
+    camera["keypoints"]["image_size"] = SIZE
+    flight.save()
+    session = session_of(flight)
+    lenses = [read_description(session).cameras[name].intrinsics for name in ("drone1", "drone2")]
+    assert (lenses[0].width, lenses[0].height, lenses[0].fx) == (*SIZE, LENS.fx)
+    assert lenses[1].width == lenses[0].width
+
+    half = np.diag([0.5, 0.5, 1.0]) @ camera_matrix(LENS)  # of pictures half as large
+    _store(tmp_path / "camera.yaml", half)
+    assert f"{SIZE[0]} x {SIZE[1]}" in refused("ingest", flight.manifest, "--overwrite")

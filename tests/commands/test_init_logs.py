@@ -9,20 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from ruamel.yaml import YAML
 
-from pipelines.draft import Drafted, draft
 from pipelines.ingest import ingest
 from tests.commands.runner import refused, succeeds
+from tests.commands.test_init import drafted
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import (
-    drone_of,
-    ulog_rows,
-    write_record,
-    write_srt,
-    write_tlog,
-    write_ulog,
-)
+from tests.synthetic.drone_logs import drone_of, ulog_rows, write_record, write_srt, write_tlog, write_ulog
 from tests.synthetic.flights import LENS, START_NS, write_flight
 from tests.synthetic.logged_flights import fix_entry, header
 from tests.synthetic.logs import Entry, write_log, write_mcap
@@ -32,11 +24,6 @@ from tests.synthetic.videos import SIZE, even_ticks, write_video
 
 FRAMES = 30
 UPTIME_NS = 900_000_000_000  # a stamp of simulation time
-
-
-def drafted(folder: Path) -> tuple[Drafted, dict[str, Any]]:
-    result = draft([folder])
-    return result, YAML(typ="safe", pure=True).load(result.text)
 
 
 def write_pictures(folder: Path, name: str = "keypoints") -> None:

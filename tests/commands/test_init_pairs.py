@@ -18,14 +18,7 @@ from pipelines.formats.poses import TUM
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import matrix_from_quaternion
 from tests.commands.runner import mocap
-from tests.synthetic.drone_logs import (
-    HOME,
-    DroneTruth,
-    angles_of,
-    ulog_rows,
-    write_dataflash,
-    write_ulog,
-)
+from tests.synthetic.drone_logs import HOME, DroneTruth, angles_of, ulog_rows, write_dataflash, write_ulog
 from tests.synthetic.logged_flights import pose_entry
 from tests.synthetic.logs import write_mcap
 from tests.synthetic.videos import even_ticks, write_video

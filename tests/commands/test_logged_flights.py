@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from ruamel.yaml import YAML
 
 from pipelines.formats.logs.recordings import TRUNCATED
 from pipelines.geometry.poses import conjugate, multiply
 from pipelines.session.storage import read_json
 from tests.commands.runner import content, measured, mocap, refused, succeeds
+from tests.commands.test_init import tables
+from tests.real_data import facts, real_data
 from tests.synthetic.logged_flights import write_logged_flight
 from tests.synthetic.logs import CONTAINERS, Container, cut
 
@@ -22,11 +25,6 @@ def ingested(folder: Path) -> tuple[Path, dict[str, Any]]:
     succeeds("ingest", folder / "flight.yaml")
     session = folder / "flight.session"
     return session, read_json(session / "session.json")
-
-
-def tables(session: Path) -> dict[str, str]:
-    """Hash the tables of the session, without session.json, which names the logs."""
-    return {name: digest for name, digest in content(session).items() if name.endswith(".parquet")}
 
 
 def test_every_container_gives_the_same_session(tmp_path: Path) -> None:
@@ -145,3 +143,85 @@ def test_logged_pictures_of_another_size_are_distinguished_from_those_of_the_cal
     lens = description["cameras"]["drone1"]["intrinsics"]
     assert (lens["width"], lens["height"], lens["fx"], lens["cy"]) == (640, 360, 381.0, 178.75)
     assert any(re.search("drone1: .* 640 x 360", line) for line in description["warnings"])
+
+
+FRAMES = 20
+
+
+def write_flight(
+    folder: Path, pose: dict[str, Any], start_s: float, *, mounted: bool = False, **parts: Any
+) -> Path:
+    """Write a flight of one camera with poses from a real log, and keypoints that are always present."""
+    people = [
+        {
+            "image_id": k,
+            "category_id": 1,
+            "keypoints": [*(v for j in range(17) for v in (100 + j, 200 + k, 0.9))],
+            "score": 1.0,
+        }
+        for k in range(FRAMES)
+    ]
+    (folder / "keypoints.json").write_text(json.dumps(people), encoding="utf-8")
+    camera = {
+        "pose": pose,
+        "intrinsics": {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240},
+        "frame_times": {"start": start_s, "fps": 10},
+        "keypoints": "keypoints.json",
+    }
+    if mounted or pose.get("of") == "body":
+        camera["mount"] = {"looks": "forward"}
+    path = folder / "flight.yaml"
+    with path.open("w", encoding="utf-8") as file:
+        YAML(typ="safe", pure=True).dump({"schema": 1, "cameras": {"husky": camera}, **parts}, file)
+    return path
+
+
+def copied(folder: Path, name: str) -> str:
+    """Copy a log beside the manifest; return its name."""
+    return Path(shutil.copy(real_data(name), folder)).name
+
+
+def poses_of(path: Path) -> pd.DataFrame:
+    return pd.read_parquet(path.with_suffix(".session") / "cameras" / "husky" / "poses.parquet")
+
+
+def session_of(path: Path) -> dict[str, Any]:
+    return read_json(path.with_suffix(".session") / "session.json")
+
+
+def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
+    name = "logs/ros1/husky_gps_imu_odom.bag"
+    expected = facts(name)["topics"]["/husky_velocity_controller/odom"]
+    first_s, last_s = expected["header_stamp_range"]
+    path = write_flight(tmp_path, {"file": str(real_data(name)), "of": "body"}, start_s=first_s + 10)
+    done = mocap("ingest", path)
+    assert done.returncode == 0, done.stderr
+    assert " /husky_velocity_controller/odom, " in done.stderr
+    poses = poses_of(path)
+    assert len(poses) == expected["count"]
+    assert session_of(path)["cameras"]["husky"]["poses"]["dropped"] == {}
+    # Stated with six decimals, stamps as doubles of seconds since the epoch.
+    position = poses[["x", "y", "z"]].to_numpy()
+    assert position.min(axis=0) == pytest.approx(expected["position_bbox"]["min"], abs=1e-6)
+    assert position.max(axis=0) == pytest.approx(expected["position_bbox"]["max"], abs=1e-6)
+    assert poses["t_ns"].iloc[[0, -1]].to_numpy() / 1e9 == pytest.approx([first_s, last_s], abs=1e-6)
+    assert np.linalg.norm(np.diff(position, axis=0), axis=1).sum() == pytest.approx(
+        expected["path_length"], abs=1e-3
+    )
+
+
+def test_a_phantom_with_gimbal_angles_as_a_command(tmp_path: Path) -> None:
+    name = "logs/dji_srt/p4_rtk.SRT"
+    told = facts(name)
+    path = write_flight(tmp_path, {"file": copied(tmp_path, name)}, 10.0)
+    done = mocap("ingest", path, "--max-pose-gap", "1.5")
+    assert done.returncode == 0, done.stderr
+    latitude, longitude = told["lat_lon_first"]
+    assert f"world origin: {latitude:.7f}, {longitude:.7f}, 0.00 m (p4_rtk.SRT)" in done.stdout
+    assert "shows no clock" in done.stderr
+    poses = poses_of(path)
+    assert len(poses) == told["positions"]
+    assert poses["z"].min() == pytest.approx(told["H_m"]["min"], abs=0.04)  # the Earth falls away on 700 m
+    # D is the drone's own distance from its take-off, from its unrounded positions.
+    flown = np.hypot(*(poses[axis].iloc[-1] - poses[axis].iloc[0] for axis in ("x", "y")))
+    assert flown == pytest.approx(660, abs=5)

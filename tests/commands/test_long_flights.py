@@ -7,13 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines import report
-from pipelines.reconstruct import ReconstructSettings, reconstruct
+from pipelines.reconstruct import reconstruct
 from pipelines.reconstruction import refining
-from pipelines.report import content_of
-from pipelines.reporting.summary import summarise
-from pipelines.session.camera_poses import poses_at
-from pipelines.session.tables import trajectory_from
 from tests.commands.runner import content, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
@@ -69,33 +64,3 @@ def test_a_clock_is_that_of_the_whole_flight(tmp_path: Path, short_windows: None
     cameras = pd.read_parquet(session / "reconstruct" / "cameras.parquet")
     own = cameras[cameras["camera"] == "drone2"]["t_ns"].to_numpy()
     assert len(np.unique(own - flight.t_ns[: len(own)])) == 1
-
-
-def test_the_page_of_a_long_flight_is_drawn_from_some_of_its_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    flight = write_flight(tmp_path, seconds=2.0)
-    session = ingested(flight)
-    reconstruct(session, ReconstructSettings(method="robust"), workers=1)
-    whole = content_of(session)
-    monkeypatch.setattr(report, "MAX_ROWS", 20 * 17)
-    some = content_of(session)
-    assert (whole.every, some.every) == (1, 3)
-    assert whole.skeleton is not None
-    assert some.skeleton is not None
-    assert np.array_equal(np.unique(some.skeleton["t_ns"]), flight.t_ns[::3])
-    shown = whole.skeleton["t_ns"].isin(flight.t_ns[::3])
-    pd.testing.assert_frame_equal(some.skeleton, whole.skeleton[shown].reset_index(drop=True))
-    assert summarise(some).counts == summarise(whole).counts
-    for name in flight.cameras:
-        frames = some.frames[name]["t_ns"].to_numpy()
-        assert set(frames) == {*flight.t_ns[::3].tolist(), int(flight.t_ns[-1])}
-        assert set(some.keypoints[name]["frame"]) <= set(some.frames[name]["frame"])
-        assert len(some.poses[name]) < len(whole.poses[name]) / 2
-        # A pose at one of these times lies between the same two logged ones.
-        between = whole.session.pose_interpolation
-        found = [poses_at(trajectory_from(of.poses[name]), flight.t_ns[::3], between) for of in (some, whole)]
-        assert np.array_equal(found[0][0], found[1][0])
-    succeeds("report", session)
-    page = (session / "report" / "index.html").read_text(encoding="utf-8")
-    assert "one in 3 of its times" in " ".join(page.split())

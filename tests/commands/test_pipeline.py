@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from tests.commands.runner import ingested, mocap, refused, result_of, succeeds
+from tests.commands.runner import ingested, mocap, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
 METHODS = ("dlt", "midpoint", "robust")
@@ -84,29 +84,6 @@ def test_tables_are_read_by_pandas_alone(flight: SyntheticFlight, session: Path)
     assert list(frames.columns) == ["frame", "t_ns", "pts_ns"]
 
 
-def test_exports_lie_beside_the_session_and_are_not_overwritten(session: Path) -> None:
-    result = result_of("export", session, "--to", "trc,csv,tum")
-    assert {Path(path).suffix for path in result["written"]} == {".trc", ".csv", ".tum"}
-    assert result_of("export", session, "--to", "trc")["written"] == []
-    trc = next(Path(path) for path in result["written"] if path.endswith(".trc"))
-    trc.write_text("changed by hand", encoding="utf-8")
-    refused("export", session, "--to", "trc", code="exists")
-    succeeds("export", session, "--to", "trc", "--overwrite")
-    assert trc.read_text(encoding="utf-8").startswith("PathFileType")
-
-
-def test_info_knows_what_it_wrote_and_what_it_reads(flight: SyntheticFlight, session: Path) -> None:
-    folder = flight.manifest.parent
-    for path, kind in (
-        (session, "session"),
-        (flight.manifest, "manifest"),
-        (folder / "drone1.json", "AlphaPose"),
-        (folder / "drone1.tum", "TUM"),
-    ):
-        [reading] = result_of("info", path)["readings"]
-        assert kind in reading["kind"]
-
-
 def test_unchanged_stages_are_skipped_and_changed_settings_replace(
     flight: SyntheticFlight, session: Path
 ) -> None:
@@ -116,10 +93,3 @@ def test_unchanged_stages_are_skipped_and_changed_settings_replace(
     replaced = mocap("reconstruct", session, "--method", "dlt")
     assert re.search(r"\bmethod\b.*\brobust\b.*\bdlt\b", replaced.stderr)
     assert "written" in replaced.stdout
-
-
-def test_help_of_every_command() -> None:
-    for command in ("init", "ingest", "reconstruct", "report", "export", "info"):
-        assert f"mocap {command} [OPTIONS]" in succeeds(command, "--help")
-    assert mocap("ingest").returncode == 2
-    assert mocap("reconstruct", "/nowhere", "--method", "magic").returncode == 2

@@ -12,11 +12,10 @@ from click.testing import CliRunner, Result
 from mocap_cli.main import Mocap
 from mocap_cli.study import study_command
 from pipelines import study as stage
-from pipelines.geometry.noise import White
 from pipelines.replan import fly_and_measure
 from pipelines.session.errors import DataError
-from pipelines.simulation.walks import RANGE_M, exact_keypoints, formation, views_of, walk
-from pipelines.study import Studied, study, values_of
+from pipelines.simulation.walks import RANGE_M
+from pipelines.study import Studied, study
 from tests.commands.runner import content
 from tests.commands.test_replan import CALM, session_of
 
@@ -85,39 +84,6 @@ def test_errors_of_poses_have_the_size_and_shape_of_the_geometry(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_the_studies_of_the_paper_have_its_shapes(tmp_path: Path) -> None:
-    """Compare with `covariance_trace`: +3 % error at 30 deg, +43 % at 60; -38 % for 5 drones instead of 2.
-
-    The noise is high. 8 s x 10 Hz x 3 trials = 240 draws scatter by 3.2 % in a mean and 4.6 % in a ratio. The
-    bounds are at least two of those away.
-    """
-    options = ("noise=high", "seconds=8", "rate_hz=10", "trials=3", "method=dlt,robust")
-    tilted = cells_of(study(["tilt_deg=0,30,60", *options], None, tmp_path / "tilt"))
-    crowded = cells_of(study(["robots=2,3,5", *options], None, tmp_path / "robots"))
-    for method in ("dlt", "robust"):
-        low, steep = (tilted[tilt, 2, "high", method]["ratio"]["mean"] for tilt in (30, 60))
-        assert low < 1.15
-        assert steep > 1.3
-        error = [crowded[15, n, "high", method]["metrics"]["mpjpe_mm"]["mean"] for n in (2, 3, 5)]
-        assert crowded[15, 5, "high", method]["ratio"]["mean"] < 0.72
-        assert error[0] > error[1] > error[2]
-
-
-def test_trials_of_two_formations_share_their_chance() -> None:
-    """Check that equal draws move the first camera by equal vectors in any place, and scale with sigma."""
-    of = walk(2.0, 5.0, 0)
-    moved = []
-    for tilt_deg, sigma in ((0.0, 0.1), (45.0, 0.2)):
-        seen_by = formation(of, cameras=2, tilt_deg=tilt_deg)
-        views = views_of(
-            of, seen_by, exact_keypoints(of, seen_by), [White(position_m=sigma)], seed=3, trial=1
-        )
-        moved.append((views.position - np.moveaxis(seen_by.position, 0, 1)) / sigma)
-    assert moved[0] == pytest.approx(moved[1], abs=1e-9)
-    assert not np.allclose(moved[0][:, 0], moved[0][:, 1])
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_auto_halves_white_errors_where_all_methods_have_a_point(tmp_path: Path) -> None:
     """Expect half the error: white errors are new in every picture, so n pictures reduce them by sqrt(n).
 
@@ -179,15 +145,6 @@ def test_what_an_interrupted_study_finished_is_kept(tmp_path: Path, monkeypatch:
     assert content(tmp_path / "out") == content(tmp_path / "whole")
     # Nothing else is left beside the two.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
-
-
-def test_values_are_lists_ranges_and_models() -> None:
-    assert values_of(["tilt_deg=0:60:15", "robots=2, 3"]) == {
-        "tilt_deg": ("0", "15", "30", "45", "60"),
-        "robots": ("2", "3"),
-    }
-    model = "bias:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.1"
-    assert values_of([f"noise={model}; white:position_m=1"])["noise"] == (model, "white:position_m=1")
 
 
 @pytest.mark.parametrize(

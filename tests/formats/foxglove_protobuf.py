@@ -2,13 +2,7 @@
 
 from typing import Any
 
-from google.protobuf import (
-    descriptor_pb2,
-    descriptor_pool,
-    json_format,
-    message_factory,
-    timestamp_pb2,
-)
+from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory, timestamp_pb2
 
 # A star means a repeated field, a capital a message; the rest are protobuf's own words.
 _MESSAGES = {

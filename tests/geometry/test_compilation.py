@@ -2,7 +2,6 @@
 
 import importlib
 import importlib.util
-import logging
 import os
 import sys
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.geometry.compilation import LOGGER, _Announcement, cached
+from pipelines.geometry.compilation import cached
 
 SOURCE = """
 from pipelines.geometry.compilation import cached, helper
@@ -120,21 +119,6 @@ def test_where_no_cache_can_be_written_temporary_files_hold_it_unless_others_may
 
     assert load_quarter()(2.0) == 0.5
     assert bool(cache_files(folder)) is not of_others
-
-
-def test_the_first_compilation_of_a_process_is_announced_and_no_other(
-    load_quarter: Callable[[], Callable[[float], float]],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    monkeypatch.setattr(_Announcement, "_done", False)
-    for listener in importlib.import_module("numba.core.event")._registered["numba:compile"]:
-        if isinstance(listener, _Announcement):
-            monkeypatch.setattr(listener, "_done", False)
-    with caplog.at_level(logging.INFO, logger=LOGGER.name):
-        load_quarter()(2.0)
-        load_quarter()(2)  # another type is compiled as well
-    assert [record.name for record in caplog.records] == [LOGGER.name]
 
 
 def test_of_processes_that_start_together_one_compiles(

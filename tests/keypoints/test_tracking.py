@@ -1,5 +1,6 @@
 """Tracking of people through pictures in which their places are known."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -8,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.geometry.arrays import Picture
-from pipelines.keypoints.search import Hint
+from pipelines.geometry.arrays import Intrinsics, Picture
+from pipelines.keypoints.corrections import measured_for, read_calibration
+from pipelines.keypoints.search import Hint, Tile, find_in, project_actor, tiles
 from pipelines.keypoints.tracking import PeopleTracker, TrackedPerson
 from pipelines.session.registries import Person, Region
 from tests.keypoints.bars import Bar, BarNetworks, draw
@@ -30,13 +32,6 @@ def _run(
     hints = [None] * len(pictures) if hints is None else hints
     seen = [tracker.step(picture, hints=[hint]) for picture, hint in zip(pictures, hints, strict=True)]
     return seen, tracker, networks
-
-
-class _Shortsighted(BarNetworks):
-    """Person detector that misses everybody."""
-
-    def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
-        return super().find_people(np.zeros_like(picture))
 
 
 def _tracks(seen: list[list[TrackedPerson]]) -> list[list[int]]:
@@ -230,3 +225,102 @@ def test_what_is_found_depends_on_the_pictures_alone(scenes: list[tuple[int, boo
         for a, b in zip(one, other, strict=True):
             np.testing.assert_array_equal(a.person.xy, b.person.xy)
     assert trackers[0].counts == trackers[1].counts
+
+
+CAMERA = Intrinsics(width=1280, height=720, fx=800.0, fy=800.0, cx=639.5, cy=359.5)
+# At the origin, looking along the world's x: camera x is the world's -y, camera y its -z.
+POSE = (np.zeros(3), np.array([-0.5, 0.5, -0.5, 0.5]))
+
+
+def _hint(x: float, y: float, z: float, sigma_m: float = 0.0, sigma_rad: float = 0.0) -> Hint | None:
+    return project_actor(np.array([x, y, z]), POSE, CAMERA, sigma_m=sigma_m, sigma_rad=sigma_rad)
+
+
+def test_an_actor_ahead_is_in_the_middle_and_as_tall_as_the_range_says() -> None:
+    hint = _hint(10, 0, 0, sigma_m=0.3, sigma_rad=math.radians(1))
+
+    assert hint is not None
+    assert hint.centre == pytest.approx((639.5, 359.5))
+    assert hint.height_px == pytest.approx(800 * 1.75 / 10, rel=1e-3)
+    assert hint.margin_px == pytest.approx(3 * 800 * math.hypot(0.03, math.radians(1)), rel=1e-3)
+
+
+@pytest.mark.parametrize("place", [(-10, 0, 0), (0, 1, 0), (10, 9, 0), (10, 0, -6), (10, math.nan, 0)])
+def test_no_hint_behind_beside_outside_or_unknown(place: tuple[float, float, float]) -> None:
+    assert _hint(*place) is None
+
+
+def test_an_actor_outside_by_less_than_the_margin_is_hinted_at() -> None:
+    # 40 px beyond the left border; the margin is 3 x 800 x 0.2 / 10 = 48 px there or more.
+    y = (639.5 + 40) / 80
+
+    assert _hint(10, y, 0, sigma_m=0.1) is None
+    assert _hint(10, y, 0, sigma_m=0.25) is not None
+
+
+def _holds(tile: Tile, x: float, y: float, size: float) -> bool:
+    """Test if a square of that size around a place is whole in the tile, up to a pixel of rounding."""
+    across = tile.left - 1 <= x - size / 2 and x + size / 2 <= tile.left + tile.width + 1
+    return across and tile.top - 1 <= y - size / 2 and y + size / 2 <= tile.top + tile.height + 1
+
+
+@given(
+    width=st.integers(640, 4096),
+    height=st.integers(640, 4096),
+    share=st.sampled_from([1.0, 0.5, 0.25]),
+    place=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+)
+def test_a_body_of_a_third_of_a_tile_is_whole_in_one(
+    width: int, height: int, share: float, place: tuple[float, float]
+) -> None:
+    side = round(min(width, height) * share)
+    body = side / 3
+    x = body / 2 + place[0] * (width - body)
+    y = body / 2 + place[1] * (height - body)
+
+    assert any(_holds(tile, x, y, body) for tile in tiles(width, height) if tile.width == tile.height == side)
+
+
+def test_people_are_found_once_and_in_the_pixels_of_the_whole_picture() -> None:
+    people = [Bar(700, 500, 121), Bar(760, 505, 121), Bar(1500, 300, 201)]
+    picture = draw(1920, 1080, *people)
+
+    found = find_in(BarNetworks(), picture, tiles(1920, 1080))
+
+    # Those cut off by a tile's border may remain as further candidates: none elsewhere than on a body.
+    for person in people:
+        assert np.min([np.hypot(r.centre[0] - person.x, r.centre[1] - person.y) for r, *_ in found]) <= 0.5
+    places = np.array([each.region.centre for each in found])
+    apart = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(len(places), 1)]
+    # 0.2 of a region's side of 1.25 heights: cut bodies of 121 px have smaller regions.
+    assert apart.min() >= 0.2 * 1.25 * 121 * 0.25
+
+
+@settings(max_examples=20)
+@given(x=st.integers(40, 920), y=st.integers(40, 500))
+def test_small_people_are_found_by_tiles_and_not_in_the_whole(x: int, y: int) -> None:
+    picture = draw(960, 540, Bar(x, y, 71))
+
+    assert not find_in(BarNetworks(), picture, tiles(960, 540)[:1])
+    best = find_in(BarNetworks(), picture, tiles(960, 540))[0]
+    assert best.region.centre == pytest.approx((x, y), abs=0.5)
+
+
+@pytest.mark.parametrize("detector", ["blazepose", "blazepose-heavy"])
+def test_keypoints_in_any_order_are_worth_the_same(detector: str) -> None:
+    path = measured_for(detector)
+    assert path is not None
+    assert measured_for("onnx:somebody's") is None
+    calibration = read_calibration(path)
+    assert "tools/detector_errors.py" in calibration.origin
+    joints = ("left_wrist", "nose", "right_hip")
+    confidence = np.random.default_rng(4).uniform(0.0, 1.0, (50, 3))
+    expected = calibration.probability(confidence, joints)
+    order = np.random.default_rng(5).permutation(150)
+    names = np.tile(np.array(joints), 50)
+    assert np.array_equal(
+        calibration.probabilities(confidence.ravel()[order], names[order]), expected.ravel()[order]
+    )
+    # Joints with high confidence are right more often than not, and the other way round.
+    assert calibration.probability(np.array([[0.9]]), ("left_knee",))[0, 0] > 0.9
+    assert calibration.probability(np.array([[0.2]]), ("left_knee",))[0, 0] < 0.5

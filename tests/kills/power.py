@@ -28,8 +28,7 @@ import numpy as np
 from pipelines.session.errors import DataError
 from pipelines.session.stages import STAGES, locked
 from tests.commands.runner import mocap, succeeds
-from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
-from tests.kills.killing import SCENARIO, kept
+from tests.kills.killing import kept
 from tests.synthetic.flights import write_flight
 
 Disk = Mapping[str, bytes | None]
@@ -310,11 +309,6 @@ def _visible(folder: Path) -> dict[str, str]:
     }
 
 
-def _made(folder: Path) -> dict[str, str]:
-    """List a folder that is made whole; between two renames, that which the same command puts back."""
-    return _visible(folder if folder.exists() else folder.parent / f".{folder.name}.making" / "old")
-
-
 def _of_session(
     name: str,
     session: Path,
@@ -336,9 +330,9 @@ def _ingest_again(name: str, place: Path) -> Case:
     return _of_session(name, session, ["ingest", flight.manifest, "-o", session], before)
 
 
-def _ingested(place: Path, seconds: float = 0.3) -> Path:
+def _ingested(place: Path) -> Path:
     session = place / "flown.session"
-    succeeds("ingest", write_flight(place, seconds=seconds).manifest, "-o", session)
+    succeeds("ingest", write_flight(place, seconds=0.3).manifest, "-o", session)
     return session
 
 
@@ -346,15 +340,6 @@ def _reconstruct(name: str, place: Path) -> Case:
     session = _ingested(place)
     before = partial(succeeds, "reconstruct", session, "--method", "dlt")
     return _of_session(name, session, ["reconstruct", session, "--method", "robust"], before)
-
-
-def _detect(name: str, place: Path) -> Case:
-    """Detection in blocks, which are kept in `.partial`."""
-    session = place / "flown.session"
-    succeeds("ingest", write_spotted_flight(place, 20), "-o", session)
-    options = ("--detector", spot_detector(place))
-    made = _of_session(name, session, ["reconstruct", session, *options, "--workers", "1"])
-    return replace(made, whole=False)
 
 
 def _export(name: str, place: Path) -> Case:
@@ -366,24 +351,10 @@ def _export(name: str, place: Path) -> Case:
     return Case(name, arguments, files, files, before, whole=False)
 
 
-def _simulate(name: str, place: Path) -> Case:
-    scenario, target = place / "scenario.yaml", place / "simulated"
-
-    def before() -> None:
-        scenario.write_text(SCENARIO.replace("seed: 3", "seed: 4"), encoding="utf-8")
-        succeeds("simulate", scenario, "-o", target)
-        scenario.write_text(SCENARIO, encoding="utf-8")
-
-    files = partial(_files_beside, target)
-    return Case(name, ["simulate", scenario, "-o", target], partial(_made, target), files, before)
-
-
 _CASES: Mapping[str, Callable[[str, Path], Case]] = {
     "ingest again": _ingest_again,
     "reconstruct": _reconstruct,
-    "detect": _detect,
     "export": _export,
-    "simulate": _simulate,
 }
 
 

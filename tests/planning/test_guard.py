@@ -7,11 +7,7 @@ from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import (
-    DistanceField,
-    distance_field,
-    open_space,
-)
+from pipelines.planning.distance_field import DistanceField, distance_field, open_space
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.guard import FlownMotion, Guard, least_distances, wanted_clearance_m
 from pipelines.planning.local import DronePlan

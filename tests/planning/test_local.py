@@ -7,8 +7,8 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig, PlannerTuning
-from pipelines.planning.distance_field import DistanceField, distance_field, open_space
-from pipelines.planning.local import TERMS, DronePlan, LocalPlanner
+from pipelines.planning.distance_field import DistanceField, distance_field
+from pipelines.planning.local import DronePlan, LocalPlanner
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import bare_ground, mound
 
@@ -54,29 +54,6 @@ def test_the_gradient_is_the_derivative_of_the_cost(seed: int, speed_floor: floa
         step[place] = h
         numeric[place] = (cost(waypoints + step)[0] - cost(waypoints - step)[0]) / (2 * h)
     assert np.abs(numeric - gradient).max() < 1e-4 * np.abs(gradient).max()
-
-
-def test_the_metric_is_the_curvature_of_the_smooth_terms() -> None:
-    """Without obstacles the cost is quadratic, and the first step of eta = 1 its minimum."""
-    rng = np.random.default_rng(6)
-    planner = LocalPlanner(replace(CONFIG, tuning=replace(TUNING, step_cap_m=100.0, tolerance=1e-15)))
-    slots = np.cumsum(rng.normal(size=(20, 3)), axis=0)
-    position, velocity = rng.normal(size=(2, 3))
-    made = planner.plan(
-        0.0, position, velocity, slots=slots, actor=slots + 9, others=[], field=open_space(), previous=None
-    )
-    _, terms, gradient = planner.cost(
-        position,
-        velocity,
-        made.path[1:],
-        slots=slots,
-        actor=slots + 9,
-        others=NOBODY,
-        field=open_space(),
-    )
-    assert np.abs(gradient).max() < 1e-9
-    assert terms["obs"] == terms["occ"] == terms["sep"] == 0
-    assert tuple(terms) == TERMS
 
 
 def test_terms_of_a_steady_flight_in_closed_form() -> None:

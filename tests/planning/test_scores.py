@@ -1,13 +1,32 @@
-"""Figures of flights that are known by construction."""
+"""Figures of flights that are known by construction, their comparison, and what drones see."""
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
+from pipelines.geometry.noise import White
+from pipelines.geometry.poses import look_at
+from pipelines.planning.comparison import (
+    common_frames,
+    coverage,
+    equal_ranges,
+    mean_over_time,
+    mpjpe_mm,
+    pck,
+    worth_flying,
+)
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import open_space
+from pipelines.planning.distance_field import DistanceField, distance_field, open_space, visible
 from pipelines.planning.formation import formation_slots, slot_offsets
+from pipelines.planning.replay import CameraPaths, measure
 from pipelines.planning.scores import predicted_errors, propulsion_w, score
+from pipelines.session.records import Occupancy
 from tests.planning.worlds import wall
 
 CONFIG = PlannerConfig()
@@ -83,3 +102,210 @@ def test_what_the_wall_hides_and_who_flies_into_it() -> None:
     assert isinstance(figures["limit_violations"], dict)
     assert figures["limit_violations"]["collision"] == figures["limit_violations"]["clearance"] == 1
     assert figures["tilt_deg"] == pytest.approx({"mean": 0, "max": 0}, abs=1e-9)
+
+
+def test_a_finer_time_makes_a_mean_no_surer() -> None:
+    """A value that holds for 5 s is as sure as there are such values, however fine the time.
+
+    Stretches of 5 s that begin anywhere hold parts of two values: (1 - u)^2 over the lags u makes 2/3 of the
+    variance. The ends of 2000 draws scatter by 4 % of half a width; the variance of 100 sums by 8 %.
+    """
+    held = np.random.default_rng(1).normal(size=100)
+    for rate_hz in (2, 50):
+        t_s = np.arange(0, 500, 1 / rate_hz)
+        values = held[(t_s // 5).astype(np.int64)]
+        estimate = mean_over_time(values, nanoseconds(t_s), seed=0)
+        assert estimate is not None
+        assert estimate["interval"] is not None
+        width = estimate["interval"][1] - estimate["interval"][0]
+        assert width == pytest.approx(2 * 1.96 * held.std() * np.sqrt(2 / 3 / 100), rel=0.15)
+
+
+def nanoseconds(t_s: Float) -> Int64:
+    return np.round(t_s * 1e9).astype(np.int64)
+
+
+def test_errors_on_common_joint_frames() -> None:
+    """Two trials, two times, one joint: the second arm misses one, a third arm everything."""
+    nan = np.nan
+    one = np.array([[[0.1], [0.3]], [[0.2], [0.2]]], dtype=np.float32)
+    two = np.array([[[0.2], [nan]], [[0.4], [0.2]]], dtype=np.float32)
+    blind = np.full_like(one, nan)
+    shared = common_frames({"one": one, "two": two, "blind": blind})
+    assert shared[..., 0].tolist() == [[True, False], [True, True]]
+    assert mpjpe_mm(one, shared) == pytest.approx([100, 200])
+    assert mpjpe_mm(two, shared) == pytest.approx([200, 300])
+    assert mpjpe_mm(blind, np.isfinite(blind)).size == 0
+    # Of the right joints, those of all joint-frames count: what is missing is wrong.
+    assert pck(one, 2) == pytest.approx([0.5, 0.0])
+    assert pck(blind, 2) == pytest.approx([0.0, 0.0])
+    assert pck(np.full_like(one, 0.15), 4) == pytest.approx([0.5, 0.5])
+    assert coverage(two, 2) == pytest.approx([0.5, 1.0])
+    assert coverage(blind, 0) == pytest.approx([0.0, 0.0])
+
+
+def test_arms_of_equal_range_are_grouped_from_near_to_far() -> None:
+    assert equal_ranges({"a": 10.0, "b": 8.0, "c": 9.75, "d": 8.25, "e": 10.25}) == [
+        ["b", "d"],
+        ["c", "a"],  # e is 0.5 m from c, although it is near a
+        ["e"],
+    ]
+    assert equal_ranges({}) == []
+
+
+def change(points: float, mm: float, *, half: float = 0.1) -> dict[str, Any]:
+    """Return a difference in points of joints within 150 mm and in mm, with narrow intervals."""
+    return {
+        "pck150": {"mean": points / 100, "interval": [(points - half) / 100, (points + half) / 100]},
+        "mpjpe_mm": {"mean": mm, "interval": [mm - half, mm + half]},
+    }
+
+
+@pytest.mark.parametrize(
+    ("difference", "judged"),
+    [
+        (change(3.0, -8.0), [1, 1]),
+        (change(0.2, -8.0), [0, 1]),  # 0.2 points decide nothing
+        (change(3.0, 4.0), [1, 0]),  # nor do 4 mm
+        (change(3.0, 8.0), [1, -1]),
+        (change(3.0, -8.0, half=9.0), [0, 0]),  # noise
+        (change(0.0, 0.0), [0, 0]),  # the same arm twice
+    ],
+)
+def test_a_difference_counts_by_its_practical_size(difference: dict[str, Any], judged: list[int]) -> None:
+    assert worth_flying(difference) == judged
+
+
+LENS = Intrinsics(1280, 720, 760.0, 760.0, 639.5, 359.5)
+TIMES, JOINTS = 40, 5
+
+
+def exact(
+    pixels: Float, free: Bool, camera: Float, target: Float, focal_px: float, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Detect without errors every joint that is not hidden."""
+    found = np.where(free[..., None], pixels, np.nan)
+    return found, np.isfinite(found[..., 0]).astype(np.float64)
+
+
+def two_pixels_off(
+    pixels: Float, free: Bool, camera: Float, target: Float, focal_px: float, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    found, confidence = exact(pixels, free, camera, target, focal_px, rng)
+    return found + rng.normal(0, 2.0, found.shape), confidence
+
+
+def watching(*cameras: tuple[float, float, float]) -> CameraPaths:
+    """Make cameras at rest that look at a person who stands at x = 12, y = 0."""
+    middle = np.tile([12.0, 0.0, 1.0], (TIMES, 1))
+    joints = middle[:, None] + np.random.default_rng(0).uniform(-0.5, 0.5, (TIMES, JOINTS, 3))
+    position = np.repeat(np.array(cameras)[:, None], TIMES, axis=1)
+    count = len(cameras)
+    return CameraPaths(
+        t_ns=np.arange(TIMES) * 40_000_000,
+        position=position,
+        quaternion_xyzw=look_at(position, middle),
+        known=np.ones((count, TIMES), dtype=np.bool_),
+        intrinsics=[LENS] * count,
+        noise=[[]] * count,
+        joints=joints,
+        middle=middle,
+    )
+
+
+SOUTH, EAST, BEHIND_THE_WALL = (12.0, -10.0, 3.0), (22.0, 0.0, 3.0), (12.0, 14.0, 3.0)
+
+
+def test_without_errors_the_joints_come_back() -> None:
+    measured = measure(watching(SOUTH, EAST), open_space(), exact, start_m=1.5, trials=2, seed=0)
+    assert measured.error_m.shape == (2, TIMES, JOINTS)
+    assert measured.error_m.max() < 1e-6
+    assert measured.joint_frames == TIMES * JOINTS
+
+
+def test_pose_noise_costs_what_it_says() -> None:
+    """White noise of 0.1 m on two cameras 90 deg apart, level: across both axes of the plane one camera
+    decides (0.1 m each), upwards the mean of both (0.1/sqrt 2). The mean length of such an error lies
+    between the Rayleigh mean of two axes, 0.125 m, and the Maxwell mean of three, 0.160 m.
+    """
+    shot = watching((12.0, -10.0, 1.0), (22.0, 0.0, 1.0))
+    noisy = replace(shot, noise=[[White(position_m=0.1)]] * 2)
+    measured = measure(noisy, open_space(), exact, start_m=1.5, trials=20, seed=0)
+    # 800 independent poses: the mean is known to 0.06 m / sqrt(800) = 2 mm.
+    assert 0.125 - 0.008 < measured.error_m.mean() < 0.160 + 0.008
+
+
+def test_the_same_seed_draws_the_same_noise_for_any_path() -> None:
+    def errors(place: tuple[float, float, float], seed: int) -> Float:
+        shot = watching(place, EAST)
+        measured = measure(shot, open_space(), two_pixels_off, start_m=1.5, trials=3, seed=seed)
+        return measured.error_m.astype(np.float64)
+
+    one, again, other = errors(SOUTH, 4), errors(SOUTH, 4), errors(SOUTH, 5)
+    nearby = errors((12.0, -10.1, 3.0), 4)
+    assert one.tobytes() == again.tobytes()
+    assert not np.array_equal(one, other)
+    # 1 % farther away, that camera's part of the error is 1 % larger; fresh noise would differ by all of it.
+    assert np.abs(one - nearby).mean() < 0.05 * one.mean()
+
+
+RES = 0.5
+
+
+def random_field(seed: int, share: float) -> tuple[DistanceField, NDArray[np.bool_]]:
+    occupied = np.random.default_rng(seed).random((12, 10, 8)) < share
+    return distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES)), occupied
+
+
+def crossed_boxes(occupied: NDArray[np.bool_], a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Measure the longest piece of the segment inside one occupied box (slab test of every box)."""
+    low = np.argwhere(occupied) * RES
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, last = (low - a) / (b - a), (low + RES - a) / (b - a)
+    near = np.nanmax(np.minimum(first, last), axis=1).clip(0, 1)
+    far = np.nanmin(np.maximum(first, last), axis=1).clip(0, 1)
+    return float((far - near).max(initial=0.0) * np.linalg.norm(b - a))
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.02, 0.3]))
+def test_traversal_finds_every_box_that_is_crossed(seed: int, share: float) -> None:
+    field, occupied = random_field(seed, share)
+    rng = np.random.default_rng(seed)
+    camera, actor = rng.uniform(-2, 7, (2, 20, 3))
+    seen = visible(field, camera, actor, start_m=0.0)
+    for k in range(20):
+        longest = crossed_boxes(occupied, camera[k], actor[k])
+        if longest > 1e-9 or longest == 0.0:  # not where a corner is grazed
+            assert seen[k] == (longest == 0.0)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.001, 0.02, 0.98]))
+def test_within_a_leap_all_is_alike(seed: int, share: float) -> None:
+    """Every voxel within the leap of any point of a voxel has its state; far off, leaps are long."""
+    field, occupied = random_field(seed, share)
+    bricks = field.sight.bricks
+    apart = np.transpose(bricks.reshape(*bricks.shape[:3], 4, 4, 4), (0, 3, 1, 4, 2, 5))
+    byte = apart.reshape([4 * n for n in bricks.shape[:3]])[:12, :10, :8]
+    assert np.array_equal(byte % 2 == 1, occupied)
+    places = np.argwhere(np.ones_like(occupied))
+    for at in places[np.random.default_rng(seed).choice(len(places), 20)]:
+        gap = np.maximum(np.abs(places - at) - 1, 0)  # between the boxes
+        other = occupied[tuple(places.T)] != occupied[tuple(at)]
+        leap = byte[tuple(at)] // 2
+        if not other.any():
+            assert leap == 127
+            continue
+        assert leap / 2 <= np.sqrt((gap[other] ** 2).sum(axis=1)).min()
+        # D of the voxel's centre, less a diagonal, to the half voxel below
+        centres = np.sqrt(((places[other] - at) ** 2).sum(axis=1)).min()
+        assert leap >= 2 * (centres - np.sqrt(3)) - 1.01
+
+
+def test_the_end_at_the_actor_is_left_out() -> None:
+    occupied = np.zeros((40, 3, 3), dtype=np.float32)
+    occupied[0:2] = 1  # the actor's own voxels, x < 1
+    field = distance_field(Occupancy(occupied, np.zeros(3), RES))
+    actor, camera = np.array([0.75, 0.75, 0.75]), np.array([10.75, 0.75, 0.75])
+    assert not visible(field, camera, actor, start_m=0.0)
+    assert visible(field, camera, actor, start_m=1.5)
+    assert visible(field, actor + np.array([0, 0, 1.0]), actor, start_m=1.5)

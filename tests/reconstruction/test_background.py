@@ -37,7 +37,6 @@ from pipelines.reconstruction.background import (
     SeenPoints,
     adjust,
     refine_cameras,
-    with_constant_levels,
 )
 from pipelines.reconstruction.background_kernels import (
     BackgroundPoints,
@@ -231,59 +230,6 @@ def test_a_position_that_never_changes_was_surveyed_unless_pictures_show_that_it
     assert found.frozen == (moves_m > 0)
     (sigma,) = [of.sigma0 for of in found.left.processes if of.number == SHIFT_IN_WORLD and of.constant]
     assert SURVEYED_M <= sigma < 1.1 * SURVEYED_M if surveyed else sigma >= UNKNOWN_SIGMA[0]
-
-
-def _of_constants(prior: PosePrior, turn: Float, variance: float) -> PosePrior:
-    """Estimate levels from a posterior of the constant rotation; that of the arm is its prior."""
-    sigma2 = np.repeat([variance, prior.constant[2] ** 2], 3)
-    return with_constant_levels(prior, np.append(turn, np.zeros(3)), np.diag(sigma2))
-
-
-@pytest.mark.parametrize(
-    ("sigma_deg", "stands", "expected_deg"),
-    [(0.01, False, np.sqrt((0.8**2 + 0.15**2) / 2)), (0.98, False, 1.0), (0.9, True, 1.0)],
-)
-def test_level_of_a_constant_rotation_that_is_known_well_or_not_at_all(
-    sigma_deg: float, stands: bool, expected_deg: float
-) -> None:
-    """Three numbers of 0.8 deg beside three usual ones of 0.15 deg: sqrt((0.8^2 + 0.15^2) / 2) = 0.576 deg.
-
-    A posterior of 0.98 deg under a prior of 1 deg says nothing: the prior stays. Of a camera that stands, and
-    so sees no direction of its path, 0.9 deg says nothing either.
-    """
-    prior = PosePrior.of(None)
-    prior = replace(prior, constant=(*prior.constant[:2], 0.0 if stands else prior.constant[2]))
-    prior = replace(prior, slow=(prior.slow[0], replace(prior.slow[1], sigma0=0.0)))
-    found = _of_constants(prior, np.radians([0.8, 0.8, 0.8]), np.radians(sigma_deg) ** 2)
-    assert np.degrees(found.constant[1]) == pytest.approx(expected_deg, rel=1e-3)
-
-
-def test_a_constant_rotation_that_rests_on_a_drifting_path_gives_way() -> None:
-    """Expect the fixed point v = (3 u + sum of squares + 3 p) / 6 of u = 0.15^2 deg^2 and data of 0.5 deg."""
-    prior = PosePrior.of(None)
-    prior = replace(prior, slow=(prior.slow[0], replace(prior.slow[1], sigma0=0.0)))
-    data2 = 0.5**2
-    posterior2 = 1 / (1 / data2 + 1 / np.degrees(prior.constant[1]) ** 2)
-    seen = np.array([0.5, -0.5, 0.5])
-    mean = seen * posterior2 / data2
-    found = _of_constants(prior, np.radians(mean), np.radians(1.0) ** 2 * posterior2)
-    level2 = np.degrees(found.constant[1]) ** 2
-    left2 = 1 / (1 / data2 + 1 / level2)
-    right = (3 * 0.15**2 + np.sum((seen * left2 / data2) ** 2) + 3 * left2) / 6
-    assert level2 == pytest.approx(right, rel=1e-3)
-    assert level2 < 0.5 * np.degrees(prior.constant[1]) ** 2
-
-
-@pytest.mark.parametrize(("seen_m", "sigma_m", "expected_m"), [(0.2, 1e-3, 0.05), (0.0, 1e-3, 0.0212)])
-def test_the_level_of_a_lever_arm_falls_and_never_grows(
-    seen_m: float, sigma_m: float, expected_m: float
-) -> None:
-    """An arm of 0.2 m keeps the level of 0.05 m; none beside three of 0.03 m: 0.03 m / sqrt(2)."""
-    prior = PosePrior.of(None)
-    covariance = np.diag(np.square(np.repeat([prior.constant[1], sigma_m], 3)))
-    found = with_constant_levels(prior, np.append(np.zeros(3), np.full(3, seen_m)), covariance)
-    assert found.constant[2] == pytest.approx(expected_m, rel=2e-2)
-    assert found.constant[1] == prior.constant[1]
 
 
 @pytest.mark.parametrize("pictures", [60, 150])

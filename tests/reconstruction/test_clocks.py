@@ -3,12 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from pipelines.geometry.noise import pose_errors
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.noise import Bias, NoiseModel, White, pose_errors
+from pipelines.geometry.triangulation import Views
+from pipelines.reconstruction.clocks import initial_offsets_s
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from pipelines.reconstruction.refinement.system import Sighting
-from tests.reconstruction.formations import BONES, FOCAL_PX, formation
+from tests.reconstruction.formations import BONES, FOCAL_PX, Formation, formation
 
 PRIOR_S = 0.2
 
@@ -31,3 +35,65 @@ def test_a_clock_is_known_where_the_person_moves_and_unknown_where_nothing_does(
     ]
     standing = refined(frozen, flight.t_s, np.repeat(flight.start[:1], 45, axis=0))
     assert standing.clock_sigma_s[1] > 0.5 * PRIOR_S
+
+
+TIMES, LATE_S, SIGMA_S = 150, 0.45, 0.5
+STEP_S = 1 / 15
+ROUGH = [Bias(position_m=0.3, rotation_deg=1.0), White(position_m=0.1, rotation_deg=0.5)]
+
+
+def seen(flight: Formation, shift_s: float, unknown: NDArray[np.bool_]) -> Views:
+    """Build the flight's joint-frames with the stamps of unknown clocks moved forward."""
+    views: list[Float] = []
+    for camera, sighting in enumerate(flight.sightings):
+        at_s = flight.t_s - (shift_s if unknown[camera] else 0.0)
+        xy = sighting.rays.reshape(len(flight.t_s), -1)
+        moved = [np.interp(at_s, flight.t_s, column, left=np.nan, right=np.nan) for column in xy.T]
+        views.append(np.stack(moved, axis=1).reshape(-1, 2))
+    times, joints = flight.sightings[0].confidence.shape
+    cameras = len(views)
+    rays = np.stack(views, axis=1)
+    return Views(
+        rays=rays,
+        weight=np.isfinite(rays[..., 0]).astype(np.float64),
+        pose_index=np.repeat(np.arange(times), joints),
+        position=np.stack([s.position for s in flight.sightings], axis=1),
+        rotation=np.stack([s.rotation for s in flight.sightings], axis=1),
+        focal=np.full(cameras, FOCAL_PX),
+        pixel_sigma=np.full(cameras, 2.0),
+        pose_sigma=np.zeros((times, cameras, 2)),
+    )
+
+
+def initial_offsets(flight: Formation, sigma_s: Float) -> Float:
+    return initial_offsets_s(lambda shift_s: seen(flight, shift_s, sigma_s > 0), TIMES, sigma_s)
+
+
+@pytest.mark.parametrize("models", [[], ROUGH], ids=["exact", "rough"])
+@pytest.mark.parametrize("late_s", [LATE_S, -LATE_S])
+def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: float) -> None:
+    flight = formation(TIMES, 3, models, 0, late_s=(0.0, late_s, 0.0))
+    found = initial_offsets(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
+    assert found[0] == 0.0
+    np.testing.assert_allclose(found[1:], [late_s, 0.0], atol=STEP_S)
+
+
+def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:
+    flight = formation(TIMES, 3, [], 0, late_s=(0.0, 0.0, LATE_S))
+    flight.sightings[1].rays[40:80] = np.nan
+    found = initial_offsets(flight, np.array([0.0, 0.0, SIGMA_S]))
+    np.testing.assert_allclose(found, [0.0, 0.0, LATE_S], atol=STEP_S)
+
+
+def test_no_offset_is_searched_where_all_clocks_are_known_or_none() -> None:
+    flight = formation(TIMES, 2, [], 0, late_s=(0.0, LATE_S))
+    assert not initial_offsets(flight, np.zeros(2)).any()
+    assert not initial_offsets(flight, np.full(2, SIGMA_S)).any()
+
+
+def test_who_stands_still_leaves_clocks_where_they_are() -> None:
+    flight = formation(TIMES, 2, [], 0, still=True)
+    rng = np.random.default_rng(0)
+    for sighting in flight.sightings:
+        sighting.rays[:] = sighting.rays[:1] + rng.normal(0, 2 / FOCAL_PX, sighting.rays.shape)
+    assert not initial_offsets(flight, np.array([0.0, SIGMA_S])).any()

@@ -5,11 +5,18 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.noise import ROTATION, errors_of_level
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.noise import ROTATION, PoseErrors, errors_of_level
+from pipelines.geometry.poses import quaternion_from_rotation_vector
 from pipelines.geometry.triangulation import STATUS, estimate_noise, triangulate
+from pipelines.reconstruction.log_stretches import MOST_SIGMA, mend
+from pipelines.reconstruction.refinement.refine import Refined, refine
 from pipelines.reconstruction.solving import triangulate_widened
+from pipelines.session.records import Trajectory
 from tests.geometry.rings import ring, turned, with_pixel_noise
+from tests.reconstruction.formations import BONES, Formation, formation, mean_mm, triangulated
 
 OK = STATUS.index("ok")
 
@@ -45,3 +52,154 @@ def test_a_level_alone_becomes_half_new_and_half_lasting_errors() -> None:
         assert process.constant
         found[1 if process.number == ROTATION else 0] += process.sigma0**2
     np.testing.assert_allclose(np.sqrt(found), [0.3, 0.02])
+
+
+SECONDS, RATE_HZ = 8.0, 50
+
+
+def flown(noise_m: float = 0.01, speed_mps: float = 1.0) -> Trajectory:
+    """Fly along a slightly bent line and turn meanwhile, with white noise."""
+    rng = np.random.default_rng(0)
+    t_s = np.arange(0, SECONDS, 1 / RATE_HZ)
+    place = np.stack([speed_mps * t_s, 0.05 * speed_mps * t_s**2, 5 + 0 * t_s], axis=1)
+    turn = np.stack([0 * t_s, 0 * t_s, 0.2 * speed_mps * t_s], axis=1)
+    turn += 0.1 * noise_m * rng.standard_normal(turn.shape)
+    stamps = np.round(1e9 * t_s).astype(np.int64)
+    return Trajectory(
+        stamps,
+        place + noise_m * rng.standard_normal(place.shape),
+        np.asarray(quaternion_from_rotation_vector(turn)),
+    )
+
+
+def held(log: Trajectory, every: int, rows: slice = slice(None)) -> Trajectory:
+    """Repeat every k-th pose until the next, in some rows."""
+    source = np.arange(len(log.t_ns))
+    source[rows] = source[rows.start or 0] + (source[rows] - (rows.start or 0)) // every * every
+    return Trajectory(log.t_ns, log.position[source], log.quaternion_xyzw[source])
+
+
+def off_m(log: Trajectory, truth: Trajectory) -> Float:
+    apart: Float = np.linalg.norm(log.position - truth.position, axis=1)
+    return apart
+
+
+def test_a_frozen_stretch_is_bridged_and_loosened() -> None:
+    truth = flown()
+    frozen = slice(100, 201)
+    log = held(truth, 1000, frozen)
+    found = mend(log)
+    assert (found.frozen, found.jumps) == (2, 0)  # positions and rotations
+    assert found.poses == 100
+    assert found.longest_s == pytest.approx(101 / RATE_HZ)
+    assert off_m(log, truth).max() > 1.9
+    assert off_m(found.trajectory, truth).max() < 0.12  # 0.05 m/s^2 of bending, and noise at both ends
+    assert found.loosened is not None
+    np.testing.assert_allclose(found.loosened[frozen][1:], [MOST_SIGMA] * 100)
+    outside = np.ones(len(log.t_ns), dtype=bool)
+    outside[frozen] = False
+    assert not found.loosened[outside].any()
+    np.testing.assert_array_equal(found.trajectory.position[outside], log.position[outside])
+
+
+def test_a_stepping_log_becomes_a_line_through_its_steps() -> None:
+    truth = flown()
+    found = mend(held(truth, RATE_HZ))
+    assert found.frozen > 10
+    assert off_m(found.trajectory, truth)[: -2 * RATE_HZ].max() < 0.1
+
+
+def test_a_jump_and_back_is_bridged() -> None:
+    truth = flown()
+    position = truth.position.copy()
+    position[150:220] += [2.0, -1.0, 0.5]
+    found = mend(Trajectory(truth.t_ns, position, truth.quaternion_xyzw))
+    assert (found.frozen, found.jumps, found.poses) == (0, 1, 70)
+    assert off_m(found.trajectory, truth).max() < 0.12
+
+
+@pytest.mark.parametrize(
+    "log",
+    [
+        flown(),
+        flown(noise_m=0.3),
+        flown(speed_mps=0.0),
+        flown(noise_m=0.0, speed_mps=0.0),
+        held(flown(), 10),
+        held(flown(noise_m=0.01, speed_mps=0.0), RATE_HZ),
+        Trajectory(flown().t_ns[:1], flown().position[:1], flown().quaternion_xyzw[:1]),
+    ],
+    ids=["flies", "noisy", "hovers", "stands", "at 5 Hz", "hovers at 1 Hz", "one pose"],
+)
+def test_other_logs_are_left_as_they_are(log: Trajectory) -> None:
+    found = mend(log)
+    assert found.loosened is None
+    assert found.trajectory is log
+
+
+CAMERAS, TIMES = 3, 60
+GOOD = np.repeat([0.03, np.radians(0.1)], 3)  # of position (m), rotation (rad)
+POOR = np.repeat([0.6, np.radians(2.0)], 3)
+
+
+def disturbed(root: Float, seed: int) -> Formation:
+    """Simulate a flight whose pose errors have the logged covariances root root' [C, T, 6, 6]."""
+    flight = formation(TIMES, CAMERAS, (), seed)
+    drawn = np.random.default_rng(seed).normal(size=root.shape[:3])
+    error = np.einsum("ctij,ctj->cti", root, drawn)
+    sightings = [
+        replace(
+            sighting,
+            position=sighting.position + off[:, :3],
+            rotation=sighting.rotation @ Rotation.from_rotvec(off[:, 3:]).as_matrix(),
+            pose_covariance=own @ np.swapaxes(own, 1, 2),
+        )
+        for sighting, off, own in zip(flight.sightings, error, root, strict=True)
+    ]
+    return replace(flight, sightings=sightings, start=triangulated(sightings))
+
+
+def refined(flight: Formation, *, logged: bool) -> Refined:
+    """Refine with the covariances (`logged`), or with their level alone."""
+    stated = [sighting.pose_covariance for sighting in flight.sightings]
+    covariance = np.stack([own for own in stated if own is not None])
+    variance = np.diagonal(covariance, axis1=2, axis2=3).mean(axis=(0, 1))
+    level = PoseErrors((float(variance[:3].mean() ** 0.5), float(variance[3:].mean() ** 0.5)), (), logged)
+    return refine(flight.t_s, flight.sightings, flight.start, BONES, [level] * CAMERAS, np.zeros(CAMERAS))
+
+
+def test_the_same_covariance_for_all_poses_is_a_level() -> None:
+    """Compare up to the constant that keeps inverses finite, (1e-5)^2 against (1e-3)^2 and more."""
+    flight = disturbed(np.tile(np.diag(GOOD), (CAMERAS, TIMES, 1, 1)), seed=1)
+    own, level = refined(flight, logged=True), refined(flight, logged=False)
+    assert own.fallback is None
+    np.testing.assert_allclose(own.position, level.position, atol=1e-5)
+    np.testing.assert_allclose(own.covariance, level.covariance, rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_good_poses_hold_up_the_poor_ones(seed: int) -> None:
+    """Expect a better skeleton if the log states that every other group of poses is twenty times better.
+
+    With equal weights, the mean of N poses errs by 1 / sqrt(2 N) of the poor level. With right weights, it
+    errs by 1 / sqrt(N / 2) of the good level, a tenth of that. Motion is estimated too and adds error, so
+    the test requires a factor of two.
+    """
+    poor = (np.arange(TIMES) // 10 + np.arange(CAMERAS)[:, None]) % 2 == 1
+    root = np.where(poor[..., None], POOR, GOOD)[..., None] * np.eye(6)
+    flight = disturbed(root, seed)
+    own, level = refined(flight, logged=True), refined(flight, logged=False)
+    assert own.fallback is None
+    assert not own.warnings
+    assert mean_mm(own.position, flight.truth) < 0.5 * mean_mm(level.position, flight.truth)
+
+
+def test_correlations_count() -> None:
+    """Use correlated errors of position and rotation (a lever arm): one unknown is left of six."""
+    arm = np.zeros((6, 6))
+    arm[:, 0] = [0.3, 0.2, 0.1, 0.01, 0.02, -0.01]
+    arm += np.diag(GOOD / 10)
+    flight = disturbed(np.tile(arm, (CAMERAS, TIMES, 1, 1)), seed=3)
+    own, level = refined(flight, logged=True), refined(flight, logged=False)
+    assert own.fallback is None
+    assert mean_mm(own.position, flight.truth) < 0.5 * mean_mm(level.position, flight.truth)

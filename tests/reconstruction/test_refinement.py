@@ -24,7 +24,6 @@ from pipelines.geometry.noise import (
     pose_errors,
 )
 from pipelines.reconstruction.refinement import kernels
-from pipelines.reconstruction.refinement.elimination import covariances, eliminate
 from pipelines.reconstruction.refinement.estimate import initial_state, solve
 from pipelines.reconstruction.refinement.kernels import State
 from pipelines.reconstruction.refinement.refine import (
@@ -35,13 +34,7 @@ from pipelines.reconstruction.refinement.refine import (
     refine,
 )
 from pipelines.reconstruction.refinement.system import Knowledge, System, build, lay_out, misfit, prior_cost
-from tests.reconstruction.formations import (
-    BONES,
-    STATED_PX,
-    Formation,
-    formation,
-    mean_mm,
-)
+from tests.reconstruction.formations import BONES, STATED_PX, Formation, formation, mean_mm
 
 WHITE = White(position_m=0.3, rotation_deg=1.0)
 BIAS = Bias(position_m=0.3, rotation_deg=1.0)
@@ -157,75 +150,6 @@ def test_solution_is_where_the_cost_is_least() -> None:
     before = np.abs(gradient(cost_of(system, solved), packed(state))).max()
     after = np.abs(gradient(cost_of(system, solved), at)).max()
     assert after < 1e-3 * before
-
-
-@pytest.mark.slow  # compiles much
-@pytest.mark.parametrize(
-    ("times", "knots"),
-    [(5, 3), (3, 2), (3, 6), (6, 9)],
-    ids=["usual", "one time", "knots after the last time", "several knots a time"],
-)
-def test_covariances_are_those_of_the_whole_inverse(times: int, knots: int) -> None:
-    system, state = small_system(exact=True, times=times, knots=knots)
-    # Bones are as long as the lengths say and accelerations small: Gauss-Newton's matrix is the Hessian.
-    still = np.repeat(state.position[2:3], times, axis=0)
-    ends = still[0][system.problem.bones]
-    shared = state.shared.copy()
-    shared[-2:] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
-    state = state._replace(position=still, shared=shared)
-    system = with_exact_pictures(system, state)
-    hessian = picture_hessian(system, state) + prior_hessian(system, state)
-    # Lengths of which the estimate holds 1e-6 in addition, and joints 1e-4: far below what is measured.
-    inverse = np.linalg.inv(hessian)
-    joints = still.shape[1]
-    own = inverse[: 3 * times * joints, : 3 * times * joints].reshape(times, joints, 3, times, joints, 3)
-    expected = np.einsum("tjatjb->tjab", own)
-    at = eliminate(system, state)
-    # Held joints add half of 1e-4 times their variance, below 1.4 m^2, for each of 9 unknowns at 4 times.
-    assert at.log_determinant == pytest.approx(np.linalg.slogdet(hessian)[1] / 2, abs=2.5e-3)
-    found = covariances(system, at)
-    # Second differences of costs of size 1 with steps of 1e-4 are good to 1e-8 of a curvature of 1e4.
-    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
-
-
-def picture_hessian(system: System, state: State, step: float = 1e-4) -> Float:
-    """Compute half the second derivatives of the loss at zero residuals: J' J of the residuals."""
-    at = packed(state)
-
-    def residuals(vector: Float) -> Float:
-        return misfit(system, unpacked(vector, state))[1].ravel()
-
-    moves = step * np.eye(at.size)
-    by = np.array([(residuals(at + move) - residuals(at - move)) / (2 * step) for move in moves])
-    hessian: Float = by @ by.T
-    return hessian
-
-
-def prior_hessian(system: System, state: State, step: float = 1e-4) -> Float:
-    """Compute half the second derivatives of the prior; white errors are not coupled to anything else."""
-    at = packed(state)
-
-    def cost(*moves: Float) -> float:
-        return prior_cost(system, unpacked(at + sum(moves), state))
-
-    steps = step * np.eye(at.size)
-    here = cost()
-    alone = np.array([cost(move) + cost(-move) for move in steps])
-    hessian = np.diag((alone - 2 * here) / (2 * step**2))
-    for i in range(at.size - state.white.size):
-        for j in range(i):
-            both = cost(steps[i], steps[j]) + cost(-steps[i], -steps[j])
-            hessian[i, j] = hessian[j, i] = (both - alone[i] - alone[j] + 2 * here) / (4 * step**2)
-    return hessian
-
-
-def with_exact_pictures(system: System, state: State) -> System:
-    """Return the system with pictures that match the state exactly."""
-    pictures = system.problem.pictures
-    seen = np.einsum("gij,gki->gkj", pictures.rotation, state.position[0][None] - pictures.position[:, None])
-    pictures = replace(pictures, rays=np.ascontiguousarray(seen[..., :2] / seen[..., 2:]))
-    problem = replace(system.problem, pictures=pictures)
-    return System(problem, system.knowledge, system.layout, system.bound2)
 
 
 def test_long_flights_are_factorised_in_segments_with_the_same_result(

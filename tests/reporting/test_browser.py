@@ -14,10 +14,10 @@ from pipelines.reporting.page import render_page
 from .browser import Browser, browser
 from .comparisons import make_comparison
 
-# Of the pixels that have exactly the colour of the left limbs: how many, and their middle.
-_LEFT_LIMBS = """(() => {
-  const canvas = document.getElementById('viewer-ID');
-  const colour = getComputedStyle(document.documentElement).getPropertyValue('--left').trim();
+# Of the pixels with exactly the colour of a variable: how many, and their middle; ANY: also half-drawn ones.
+_PIXELS = """(() => {
+  const canvas = document.getElementById('viewer-CANVAS');
+  const colour = getComputedStyle(document.documentElement).getPropertyValue('NAME').trim();
   const rgb = [1, 3, 5].map((k) => parseInt(colour.slice(k, k + 2), 16));
   const { width, height } = canvas;
   const copy = new OffscreenCanvas(width, height).getContext('2d', { willReadFrequently: true });
@@ -25,7 +25,8 @@ _LEFT_LIMBS = """(() => {
   const data = copy.getImageData(0, 0, width, height).data;
   let [count, x, y] = [0, 0, 0];
   for (let k = 0; k < data.length; k += 4) {
-    if (data[k + 3] === 255 && rgb.every((value, c) => data[k + c] === value)) {
+    const solid = data[k + 3] === 255;
+    if (solid ? rgb.every((value, c) => data[k + c] === value) : ANY && data[k + 3] > 0) {
       count += 1; x += (k / 4) % width; y += Math.floor(k / 4 / width);
     }
   }
@@ -61,9 +62,12 @@ def opened(chromium: Browser, page: Path) -> Iterator[Browser]:
     assert chromium.complaints == []
 
 
-def _limbs(opened: Browser, canvas: str) -> tuple[int, float, float]:
+def _pixels(
+    opened: Browser, name: str, canvas: str = "flight", *, any_drawn: bool = False
+) -> tuple[int, float, float]:
     assert opened.evaluate(_DRAWN)
-    count, x, y = opened.evaluate(_LEFT_LIMBS.replace("ID", canvas))
+    asked = _PIXELS.replace("CANVAS", canvas).replace("NAME", name)
+    count, x, y = opened.evaluate(asked.replace("ANY", "true" if any_drawn else "false"))
     return int(count), float(x), float(y)
 
 
@@ -74,7 +78,7 @@ def _go_to(opened: Browser, t_s: float) -> None:
 
 def test_playing_moves_the_skeleton(opened: Browser) -> None:
     _go_to(opened, 1.0)
-    count, x, y = _limbs(opened, "flight")
+    count, x, y = _pixels(opened, "--left", "flight")
     assert count > 3
     opened.evaluate("document.getElementById('viewer-speed').value = '5'")
     opened.click("#viewer-play")
@@ -83,24 +87,24 @@ def test_playing_moves_the_skeleton(opened: Browser) -> None:
     opened.click("#viewer-play")
     assert opened.evaluate("document.getElementById('viewer-play').textContent") == "Play"
     _go_to(opened, 4.0)
-    _, moved_x, moved_y = _limbs(opened, "flight")
+    _, moved_x, moved_y = _pixels(opened, "--left", "flight")
     # The actor walked 3.6 m, where half a canvas shows about 10 m.
     assert np.hypot(moved_x - x, moved_y - y) > 15
 
 
 def test_dragging_turns_and_the_wheel_zooms(opened: Browser) -> None:
     _go_to(opened, 3.0)
-    before = _limbs(opened, "body")
+    before = _pixels(opened, "--left", "body")
     x, y = opened.middle_of("#viewer-body")
     opened.mouse("mousePressed", x, y)
     opened.mouse("mouseMoved", x + 180, y)
     opened.mouse("mouseReleased", x + 180, y)
-    turned = _limbs(opened, "body")
+    turned = _pixels(opened, "--left", "body")
     assert turned != before
     opened.mouse("mouseWheel", x, y, deltaX=0, deltaY=-400)
-    assert _limbs(opened, "body")[0] > turned[0]
+    assert _pixels(opened, "--left", "body")[0] > turned[0]
     opened.click("#viewer-reset")
-    assert _limbs(opened, "body") == before
+    assert _pixels(opened, "--left", "body") == before
 
 
 _FOCUSED = """(() => {
@@ -152,24 +156,6 @@ def test_a_foreign_script_does_not_run(chromium: Browser, page: Path, tmp_path: 
     chromium.complaints.clear()
 
 
-# How many pixels of a canvas have exactly the colour of a variable.
-_PIXELS = """(() => {
-  const canvas = document.getElementById('viewer-flight');
-  const colour = getComputedStyle(document.documentElement).getPropertyValue('NAME').trim();
-  const rgb = [1, 3, 5].map((k) => parseInt(colour.slice(k, k + 2), 16));
-  const { width, height } = canvas;
-  const copy = new OffscreenCanvas(width, height).getContext('2d', { willReadFrequently: true });
-  copy.drawImage(canvas, 0, 0);
-  const data = copy.getImageData(0, 0, width, height).data;
-  let count = 0;
-  for (let k = 0; k < data.length; k += 4) {
-    const solid = data[k + 3] === 255;
-    if (solid ? rgb.every((value, c) => data[k + c] === value) : ANY && data[k + 3] > 0) count += 1;
-  }
-  return count;
-})()"""
-
-
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_arms_and_the_map_are_shown_as_chosen(
     chromium: Browser, content: SessionContent, tmp_path: Path, scheme: str
@@ -182,9 +168,7 @@ def test_arms_and_the_map_are_shown_as_chosen(
     chromium.wait_for("document.getElementById('viewer').dataset.ready === 'true'")
 
     def pixels(name: str, *, any_drawn: bool = False) -> int:
-        assert chromium.evaluate(_DRAWN)
-        asked = _PIXELS.replace("NAME", name).replace("ANY", "true" if any_drawn else "false")
-        return int(chromium.evaluate(asked))
+        return _pixels(chromium, name, any_drawn=any_drawn)[0]
 
     def choose(element: str, change: str) -> None:
         chromium.evaluate(

@@ -100,25 +100,6 @@ def test_ellipses_hold_95_percent(view: OverlayView) -> None:
     assert not changed(draw_frame(GROUND, replace(alone, spread=1e8 * spread), ()))[~drawn].any()
 
 
-def test_labels_stand_beside_their_joints_and_do_not_cover_each_other(view: OverlayView) -> None:
-    both = [(0, "left_hip", "left hip flexion 12 deg"), (0, "left_shoulder", "left shoulder 30 deg")]
-    bare = draw_frame(GROUND, view, ())
-    marked = [
-        (draw_frame(GROUND, view, (), labels) != bare).any(axis=-1) for labels in ([each] for each in both)
-    ]
-    for own, point in zip(marked, (BODY[0, 2], BODY[0, 0]), strict=True):
-        rows, columns = np.nonzero(own)
-        assert abs(rows.mean() - point[1]) < 15
-        assert point[0] < columns.mean() < point[0] + 300  # on the outer side: the right of the left one
-    close = replace(view, reprojected=np.where(BODY == 380.0, 302.0, BODY))
-    bare = draw_frame(GROUND, close, ())
-    apart = [(draw_frame(GROUND, close, (), [each]) != bare).any(axis=-1) for each in both]
-    together = (draw_frame(GROUND, close, (), both) != bare).any(axis=-1)
-    assert together.sum() > 1.5 * max(own.sum() for own in apart)  # one below the other, in full
-    beyond = replace(view, reprojected=BODY + 2000.0)
-    assert not (draw_frame(GROUND, beyond, (), both) != draw_frame(GROUND, beyond, ())).any()
-
-
 # --- panels ---
 
 

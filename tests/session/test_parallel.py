@@ -1,15 +1,17 @@
-"""Parts of a flight on several processes: their results, their errors, and what a worker refuses."""
+"""Parts of a flight side by side: their results, their errors, and what a worker refuses."""
 
 import os
 import signal
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 
 from pipelines.detect import Block, _DetectionOrder, detect_block
 from pipelines.session.errors import DataError
 from pipelines.session.parallel import SharedSession, each_part
+from pipelines.session.progress import Halt, side_by_side
 from pipelines.session.registries import find_detector, hashes_of_models
 from tests.commands.runner import succeeds
 from tests.keypoints.spotted_flights import spot_detector
@@ -54,3 +56,23 @@ def test_a_worker_refuses_another_session_another_program_and_other_models(tmp_p
     (tmp_path / "pose.onnx").write_bytes(b"another model")
     with refused("wrong-worker", detector.name):
         detect_block(order)
+
+
+def test_a_failure_ends_the_others() -> None:
+    halt, together = Halt(), Barrier(2, timeout=10)
+    stopped: list[int] = []
+
+    def work(part: int) -> None:
+        together.wait()
+        if part == 0:
+            raise ValueError(part)
+        while True:  # for ever, unless it is asked to stop
+            try:
+                halt.check()
+            except InterruptedError:
+                stopped.append(part)
+                raise
+
+    with pytest.raises(ValueError, match=r"^0$"):
+        side_by_side(work, range(2), workers=2, halt=halt)
+    assert stopped == [1]

@@ -1,19 +1,32 @@
-"""Storage: JSON is reproducible, hashes detect every change, errors are one line."""
+"""Storage: reproducible JSON, hashes, codes of errors, arrays that wait in files, tables read in parts."""
 
 import math
+import pickle
+import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.triangulation import STATUS
 from pipelines.session.errors import DataError
-from pipelines.session.storage import (
-    jsonable,
-    read_json,
-    sha256_of,
-    write_json,
+from pipelines.session.parallel import Waiting
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
+from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
+from pipelines.session.tables import (
+    SKELETON,
+    TRUTH,
+    join_tables,
+    motion_from,
+    read_motion,
+    read_table,
+    write_table,
 )
 
 NUMBERS = st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False)
@@ -89,3 +102,103 @@ def test_hash_of_a_folder_sees_names_contents_and_nothing_else(tmp_path: Path) -
     ]
     hashes = [sha256_of(folder(f"changed{k}", other)) for k, other in enumerate(changed)]
     assert len({reference, *hashes}) == 1 + len(changed)
+
+
+def test_a_pickled_error_keeps_its_code() -> None:
+    error = pickle.loads(pickle.dumps(DataError("a.bag", "is empty", code="empty")))  # noqa: S301
+    assert (error.code, str(error)) == ("empty", "a.bag: is empty")
+
+
+@dataclass(frozen=True)
+class Held:
+    name: str
+    values: dict[str, Float]
+    nothing: None = None
+
+
+def resident_bytes() -> int:
+    """Return the memory that the process has, pages of files included."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def test_waiting_arrays_keep_their_values_and_changes(tmp_path: Path) -> None:
+    waiting = Waiting(tmp_path)
+    values = {"a": np.arange(12.0).reshape(3, 4), "b": np.empty((0, 2)), "c": np.full(3, np.nan)}
+    held = waiting.put(Held("drone1", values))
+    assert held.name == "drone1"
+    held.values["a"][1, 2] = -1.0
+    waiting.release()
+    expected = values["a"].copy()
+    expected[1, 2] = -1.0
+    np.testing.assert_array_equal(held.values["a"], expected)
+    np.testing.assert_array_equal(held.values["c"], values["c"])
+    assert held.values["b"].shape == (0, 2)
+    assert values["a"][1, 2] == 6.0  # a copy
+    assert all(array.ctypes.data % 64 == 0 and array.flags.writeable for array in held.values.values())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say it there")
+def test_waiting_arrays_take_no_memory_until_they_are_used(tmp_path: Path) -> None:
+    """Compare 64 MB in use and waiting; a quarter of that is left for everything else."""
+    waiting = Waiting(tmp_path)
+    held = waiting.put(np.ones(8 << 20))
+    assert float(held.sum()) == 8 << 20
+    used = resident_bytes()
+    waiting.release()
+    assert used - resident_bytes() > 48e6
+    assert float(held.sum()) == 8 << 20
+
+
+JOINTS = ("nose", "left_hip", "right_hip")
+
+
+def skeleton(seed: int, times: int, people: int) -> pd.DataFrame:
+    """Return rows of a skeleton in any order, a third of them left out."""
+    rng = np.random.default_rng(seed)
+    t, person, joint = (axis.ravel() for axis in np.indices((times, people, len(JOINTS))))
+    kept = rng.permutation(len(t))[: max(2 * len(t) // 3, 1)]
+    numbers = rng.normal(size=(len(kept), 10))
+    numbers[rng.random(numbers.shape) < 0.2] = np.nan
+    columns = ("x", "y", "z", *POINT_COVARIANCE_COLUMNS, "reprojection_px")
+    return pd.DataFrame(
+        {
+            "t_ns": 1_000_000_000 + 33_000_000 * t[kept],
+            "person": person[kept],
+            "joint": np.array(JOINTS, dtype=object)[joint[kept]],
+            **dict(zip(columns, numbers.T, strict=True)),
+            "views": rng.integers(0, 4, len(kept)),
+            "status": np.array(STATUS, dtype=object)[rng.integers(0, len(STATUS), len(kept))],
+        }
+    )
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    times=st.integers(1, 30),
+    people=st.integers(1, 3),
+    parts=st.integers(1, 5),
+    joints=st.none() | st.permutations(JOINTS).map(lambda names: tuple(names[:2])),
+)
+def test_a_motion_read_in_parts_is_that_of_the_whole_table(
+    seed: int, times: int, people: int, parts: int, joints: tuple[str, ...] | None
+) -> None:
+    table = skeleton(seed, times, people)
+    rows = np.array_split(np.arange(len(table)), parts)
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place, "skeleton.parquet")
+        join_tables(path, (table.iloc[some] for some in rows), SKELETON)
+        whole = read_table(path, SKELETON)
+        expected = motion_from(whole, joints or tuple(dict.fromkeys(whole["joint"])))
+        found = read_motion(path, SKELETON, joints)
+    assert found.joints == expected.joints
+    for name in ("t_ns", "position", "status", "views", "reprojection_px", "covariance"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_a_table_without_a_column_of_the_motion_is_refused(tmp_path: Path) -> None:
+    write_table(tmp_path / "truth.parquet", skeleton(1, 4, 1), TRUTH)
+    with pytest.raises(DataError) as caught:
+        read_motion(tmp_path / "truth.parquet", SKELETON)
+    assert caught.value.source == tmp_path / "truth.parquet"
+    assert read_motion(tmp_path / "truth.parquet", TRUTH).covariance is None

@@ -25,9 +25,6 @@ from tests.synthetic.walk import COCO17
 
 # Of a prototype's measurement, the same for all joints; what comes along is measured again now and then.
 EXAMPLE = read_errors(Path(__file__).parent / "example_detector_errors.csv")
-# As many as the example has at 15 degrees.
-USUAL = DetectorErrors(missed_share=0.02, outlier_share=0.01)
-WITHOUT_SWAPS = USUAL.model_copy(update={"swap_share": 0.0})
 CLEAN = DetectorErrors(missed_share=0.0, outlier_share=0.0, swap_share=0.0)
 FRAMES = 6000
 PLACES = np.random.default_rng(9).uniform(100, 600, (17, 2))
@@ -61,12 +58,6 @@ def lengths(xy: Float) -> Float:
     """Compute the distance of every found joint from the truth, NaN where missed."""
     length: Float = np.sqrt(np.sum((xy - PLACES) ** 2, axis=-1))
     return length
-
-
-# --- the table -----------------------------------------------------------------------------------------
-
-
-# --- the view ------------------------------------------------------------------------------------------
 
 
 # --- errors --------------------------------------------------------------------------------------------
@@ -164,6 +155,3 @@ def test_confidence_has_the_measured_mean_and_falls_with_the_error(tilt_deg: flo
     tenths = confidence.ravel()[order].reshape(10, -1).mean(axis=1)
     assert (np.diff(tenths) < 0).all()
     assert tenths[0] - tenths[-1] > 0.9 * 0.14 - 0.01  # from the middle of the first to that of the last
-
-
-# --- edges ---------------------------------------------------------------------------------------------

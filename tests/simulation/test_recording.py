@@ -131,6 +131,3 @@ def test_covariances_of_the_body_are_those_of_its_errors() -> None:
     )
     assert log.camera.covariance is not None
     assert np.abs(carried - log.camera.covariance).max() < 1e-15
-
-
-# --- the actor -----------------------------------------------------------------------------------------

@@ -1,14 +1,11 @@
 """Sources of a manifest: their formats by content, the options of each, and the spellings of old files."""
 
-import inspect
 from typing import Any
 
 import pytest
 
-from pipelines.session import manifest as manifest_module
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
-from pipelines.session.yaml_models import YamlModel
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.poses import FlightPoses
@@ -32,21 +29,6 @@ FIXES = [
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> SyntheticFlight:
     return write_flight(tmp_path_factory.mktemp("flight"), cameras=2, seconds=0.2, clean=True)
-
-
-def models() -> list[type[YamlModel]]:
-    every = vars(manifest_module).values()
-    return [
-        kind
-        for kind in every
-        if inspect.isclass(kind) and issubclass(kind, YamlModel) and kind is not YamlModel
-    ]
-
-
-def test_every_key_is_described_in_a_sentence() -> None:
-    for model in models():
-        for name, field in model.model_fields.items():
-            assert (field.description or "").endswith("."), f"{model.__name__}.{name}"
 
 
 @pytest.mark.parametrize(

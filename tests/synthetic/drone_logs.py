@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Place
 from pipelines.geometry.geodesy import place_at
-from pipelines.geometry.poses import (
-    matrix_from_quaternion,
-    multiply,
-    quaternion_from_rotation_vector,
-    rotate,
-)
+from pipelines.geometry.poses import matrix_from_quaternion, multiply, quaternion_from_rotation_vector, rotate
 from tests.synthetic.flights import SyntheticFlight
 
 Int64 = NDArray[np.int64]

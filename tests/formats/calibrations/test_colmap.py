@@ -136,4 +136,4 @@ def write(folder: Path, cameras: str = CAMERAS, images: str = IMAGES) -> Path:
 )
 def test_faulty_text_is_refused(tmp_path: Path, cameras: str, images: str) -> None:
     with pytest.raises(DataError):
-        READER.read_calibration(tmp_path)
+        READER.read_calibration(write(tmp_path, cameras, images))

@@ -77,5 +77,6 @@ def test_the_real_file_projects_as_opencv_does() -> None:
     ],
 )
 def test_faulty_settings_are_refused(tmp_path: Path, old: str, new: str, word: str) -> None:
-    with pytest.raises(DataError):
-        READER.read_calibration(tmp_path / "settings.yaml")
+    assert old in FISHEYE
+    with pytest.raises(DataError, match=word):
+        READER.read_calibration(write(tmp_path, FISHEYE.replace(old, new)))

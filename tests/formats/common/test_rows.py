@@ -4,12 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.formats.common.rows import (
-    NANOSECONDS,
-    SECONDS,
-    parse_stamps,
-    parse_table,
-)
+from pipelines.formats.common.rows import NANOSECONDS, SECONDS, parse_stamps, parse_table
 from tests.raising import refused
 
 # An epoch stamp in float64 seconds has no room for nanoseconds (its step is 0.2 us).

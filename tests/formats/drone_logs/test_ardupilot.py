@@ -13,13 +13,7 @@ from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice
 from tests.raising import refused
 from tests.real_data import real_data
-from tests.synthetic.drone_logs import (
-    BOOT_NS,
-    HOME,
-    DroneTruth,
-    drone_of,
-    write_dataflash,
-)
+from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, drone_of, write_dataflash
 from tests.synthetic.flights import write_flight
 
 

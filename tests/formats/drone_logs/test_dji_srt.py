@@ -1,6 +1,5 @@
 """DJI's subtitles: real files of every generation, and the meaning of their fields."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from pipelines.formats.drone_logs.telemetry_rows import between_refreshed_angles
 from pipelines.geometry.poses import rotate
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 NAMES = [
     "MAVIC3.srt",
@@ -24,12 +23,6 @@ NAMES = [
     "p4_rtk.SRT",
     "broken_incomplete.SRT",
 ]
-
-
-def facts(name: str) -> dict[str, Any]:
-    told: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))
-    found: dict[str, Any] = told[f"logs/dji_srt/{name}"]
-    return found
 
 
 def read(path: Path, **choice: Any) -> Telemetry:
@@ -50,7 +43,7 @@ def test_real_subtitles_without_display_times_have_their_clock() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_real_files_are_read_as_their_facts_state(name: str) -> None:
-    path, told = real_data(f"logs/dji_srt/{name}"), facts(name)
+    path, told = real_data(f"logs/dji_srt/{name}"), facts(f"logs/dji_srt/{name}")
     assert FORMAT.recognises(path)
     telemetry = read(path, altitude=None if name != "mavic_2pro_new.SRT" else 50)
     assert len(telemetry.position.t_ns) + sum(telemetry.dropped.values()) == told["blocks"]
@@ -71,7 +64,7 @@ def test_the_gimbal_of_a_real_phantom_looks_where_it_flew() -> None:
     telemetry = read(real_data("logs/dji_srt/p4_rtk.SRT"))
     assert telemetry.gimbal is not None
     assert telemetry.body is not None
-    pitch, _, yaw = facts("p4_rtk.SRT")["gimbal_pry_first"]
+    pitch, _, yaw = facts("logs/dji_srt/p4_rtk.SRT")["gimbal_pry_first"]
     ahead = rotate(telemetry.gimbal.quaternion_xyzw[0], np.array([1.0, 0.0, 0.0]))
     assert np.degrees(np.arctan2(ahead[0], ahead[1])) == pytest.approx(yaw, abs=1e-9)
     assert np.degrees(np.arcsin(ahead[2])) == pytest.approx(pitch, abs=1e-9)

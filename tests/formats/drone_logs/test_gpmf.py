@@ -8,21 +8,14 @@ import pytest
 
 from pipelines.formats.drone_logs import gpmf
 from pipelines.formats.videos.video import FORMAT as VIDEO
-from pipelines.geometry.poses import (
-    rotate,
-)
+from pipelines.geometry.poses import rotate
 from pipelines.session.recognition import recognise
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice, VideoFormat
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import drone_of
 from tests.synthetic.flights import write_flight
-from tests.synthetic.video_tracks import (
-    gpmf_item,
-    gpmf_nested,
-    gpmf_numbers,
-    write_gopro,
-)
+from tests.synthetic.video_tracks import gpmf_item, gpmf_nested, gpmf_numbers, write_gopro
 
 READER = gpmf.FORMAT
 KARMA = "second/karma.mp4"

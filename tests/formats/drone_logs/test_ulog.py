@@ -1,6 +1,5 @@
 """PX4's logs: real ones against facts.json, and written ones with known truth."""
 
-import json
 import re
 import struct
 from pathlib import Path
@@ -15,25 +14,11 @@ from pipelines.geometry.poses import conjugate, multiply
 from pipelines.session.records import Telemetry
 from pipelines.session.registries import TelemetryChoice
 from tests.raising import refused
-from tests.real_data import real_data
-from tests.synthetic.drone_logs import (
-    BOOT_NS,
-    HOME,
-    DroneTruth,
-    drone_of,
-    ulog_record,
-    ulog_rows,
-    write_ulog,
-)
+from tests.real_data import facts, real_data
+from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, drone_of, ulog_record, ulog_rows, write_ulog
 from tests.synthetic.flights import write_flight
 
 NAMES = ["sample.ulg", "sample_log_small.ulg", "sample_px4_events.ulg"]
-
-
-def facts(name: str) -> dict[str, Any]:
-    told: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))
-    found: dict[str, Any] = told[f"logs/ulog/{name}"]
-    return found
 
 
 def read(path: Path, **choice: Any) -> Telemetry:
@@ -47,7 +32,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> DroneTruth:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_real_logs_are_read_as_their_facts_state(name: str) -> None:
-    path, told = real_data(f"logs/ulog/{name}"), facts(name)
+    path, told = real_data(f"logs/ulog/{name}"), facts(f"logs/ulog/{name}")
     assert FORMAT.recognises(path)
     telemetry = read(path)
     assert telemetry.body is not None

@@ -8,7 +8,7 @@ import pytest
 
 from pipelines.formats.keypoint_files.result_files import ALPHAPOSE as FORMAT
 from pipelines.session.registries import FORMATS
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 
 def entry(picture: object, idx: object = 0.0, x: float = 10.0, count: int = 17) -> dict[str, object]:
@@ -24,18 +24,18 @@ def written(folder: Path, content: object) -> Path:
 
 def test_the_real_file_holds_what_is_known_of_it() -> None:
     path = real_data("keypoints/alphapose_halpe26_video.json")
-    facts = json.loads(real_data("facts.json").read_text())["keypoints/alphapose_halpe26_video.json"]
+    told = facts("keypoints/alphapose_halpe26_video.json")
     found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    assert len(found.frame) == facts["entries"]
-    assert len(found.frames_listed) == facts["images"]
-    assert len(found.joints) == facts["keypoints"][0]
-    assert np.unique(found.frame, return_counts=True)[1].max() == facts["max_persons_per_image"]
-    np.testing.assert_allclose([*found.xy[0, 0], found.confidence[0, 0]], facts["first_keypoint"], atol=5e-4)
-    np.testing.assert_allclose(np.nanmin(found.xy, axis=(0, 1)), facts["xy_bbox"]["min"], atol=0.005)
-    np.testing.assert_allclose(np.nanmax(found.xy, axis=(0, 1)), facts["xy_bbox"]["max"], atol=0.005)
+    assert len(found.frame) == told["entries"]
+    assert len(found.frames_listed) == told["images"]
+    assert len(found.joints) == told["keypoints"][0]
+    assert np.unique(found.frame, return_counts=True)[1].max() == told["max_persons_per_image"]
+    np.testing.assert_allclose([*found.xy[0, 0], found.confidence[0, 0]], told["first_keypoint"], atol=5e-4)
+    np.testing.assert_allclose(np.nanmin(found.xy, axis=(0, 1)), told["xy_bbox"]["min"], atol=0.005)
+    np.testing.assert_allclose(np.nanmax(found.xy, axis=(0, 1)), told["xy_bbox"]["max"], atol=0.005)
     confidence = np.concatenate([entry["keypoints"][2::3] for entry in json.loads(path.read_text())])
-    assert confidence.max() == pytest.approx(facts["conf_range"][1], abs=5e-4)
-    assert facts["conf_range"][1] > 1  # AlphaPose's heatmaps slightly exceed 1
+    assert confidence.max() == pytest.approx(told["conf_range"][1], abs=5e-4)
+    assert told["conf_range"][1] > 1  # AlphaPose's heatmaps slightly exceed 1
     assert found.confidence.max() == 1
     assert list(found.adjusted.values()) == [np.count_nonzero(confidence > 1)]
     # Everybody's idx is 0 (no tracker). The second person of a frame must not count as a repeat of the first.

@@ -12,7 +12,7 @@ from pipelines.session.people import get_skeleton
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import KeypointFormat
 from tests.raising import refused
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 KIND = "keypoint file"
 
@@ -43,13 +43,13 @@ def written(folder: Path, content: object) -> Path:
 
 def test_the_real_annotations_hold_what_is_known_of_them() -> None:
     path = real_data("keypoints/coco_gt_mmpose_test_coco.json")
-    facts = json.loads(real_data("facts.json").read_text())["keypoints/coco_gt_mmpose_test_coco.json"]
+    told = facts("keypoints/coco_gt_mmpose_test_coco.json")
     assert recognise(path, KeypointFormat, KIND).name == "coco"
     found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
-    assert len(found.frame) == facts["with_keypoints"]
-    assert list(found.dropped.values()) == [facts["annotations"] - facts["with_keypoints"]]
-    assert found.frames_listed.tolist() == [int(Path(name).stem) for name in facts["file_names"]]
-    assert len(found.joints) == facts["category_keypoints"]
+    assert len(found.frame) == told["with_keypoints"]
+    assert list(found.dropped.values()) == [told["annotations"] - told["with_keypoints"]]
+    assert found.frames_listed.tolist() == [int(Path(name).stem) for name in told["file_names"]]
+    assert len(found.joints) == told["category_keypoints"]
     assert set(np.unique(found.confidence)) <= {0.0, 0.5, 1.0}
     # The first annotation: nose (367, 81, visible) in picture 785.
     assert found.frame[0] == 785

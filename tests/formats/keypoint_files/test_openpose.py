@@ -11,7 +11,7 @@ from pipelines.session.people import take_joints
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import KeypointFormat
 from tests.raising import refused
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 KIND = "keypoint file"
 
@@ -28,16 +28,16 @@ def frame_file(folder: Path, name: str, *people: object) -> None:
 
 def test_the_real_gait_recording_holds_what_is_known_of_it() -> None:
     folder = real_data("keypoints/openpose_gait")
-    facts = json.loads(real_data("facts.json").read_text())["keypoints/openpose_gait"]
+    told = facts("keypoints/openpose_gait")
     found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=0)
-    assert found.frames_listed.tolist() == list(range(facts["frames"]))
-    assert len(found.frame) == facts["people_total"]
-    assert len(set(found.frame.tolist())) == facts["frames"] - facts["frames_without_people"]
-    assert found.person.max() + 1 == facts["max_people"]
+    assert found.frames_listed.tolist() == list(range(told["frames"]))
+    assert len(found.frame) == told["people_total"]
+    assert len(set(found.frame.tolist())) == told["frames"] - told["frames_without_people"]
+    assert found.person.max() + 1 == told["max_people"]
     assert found.joints[1] == "neck"
     assert found.joints[8] == "hip"
-    assert [*found.xy[0, 0], found.confidence[0, 0]] == facts["first_keypoint"]
-    box = facts["xy_bbox_conf_gt_0"]
+    assert [*found.xy[0, 0], found.confidence[0, 0]] == told["first_keypoint"]
+    box = told["xy_bbox_conf_gt_0"]
     np.testing.assert_allclose(np.nanmin(found.xy, axis=(0, 1)), box["min"], atol=0.005)
     np.testing.assert_allclose(np.nanmax(found.xy, axis=(0, 1)), box["max"], atol=0.005)
     assert (np.isnan(found.xy[..., 0]) == (found.confidence == 0)).all()
@@ -53,8 +53,7 @@ def test_the_real_four_camera_recording_is_recognised_as_body25b(camera: str, ki
     assert found.joints == stated.joints
     assert found.frames_listed.tolist() == list(range(100))
     assert recognise(folder, KeypointFormat, KIND).name == "openpose"
-    facts = FORMAT.describe(folder)
-    assert facts["skeleton"] == "body25b (25 keypoints)"
+    assert FORMAT.describe(folder)["skeleton"] == "body25b (25 keypoints)"
     # An upright person: in the median frame the head is above the neck, and the ankles below the knees.
     order = ("head", "neck", "left_hip", "left_knee", "left_ankle")
     first_person = take_joints(found.xy[found.person == 0], found.joints, order)

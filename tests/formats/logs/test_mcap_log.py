@@ -11,28 +11,14 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from pipelines.formats.logs.messages import bytes_of
-from pipelines.formats.logs.recordings import (
-    DAMAGED,
-    TAIL,
-    TRUNCATED,
-    UNCLOSED,
-)
+from pipelines.formats.logs.recordings import DAMAGED, TAIL, TRUNCATED, UNCLOSED
 from pipelines.session.errors import DataError
-from tests.formats.log_entries import (
-    POSE,
-    entries,
-    everything,
-    everything_or_one_line,
-    log_format,
-    positions,
-)
+from tests.formats.log_entries import POSE, entries, everything, everything_or_one_line, log_format, positions
 from tests.synthetic.logs import Entry, McapCompression, cut, write_log, write_mcap
 
 FLIGHT = entries()
 ALL = [(e.topic, e.stamp_ns) for e in FLIGHT]
 _CHUNK, _MESSAGE, _MESSAGE_INDEX = 6, 5, 7
-
-PROBLEM = "cannot be decoded"  # a key of the description
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])

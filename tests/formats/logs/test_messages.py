@@ -9,11 +9,7 @@ import pytest
 from pipelines.formats.logs.messages import all_samples, samples
 from pipelines.geometry.arrays import Intrinsics
 from pipelines.session.errors import DataError
-from pipelines.session.records import (
-    AngleSample,
-    IntrinsicsSample,
-    PoseSample,
-)
+from pipelines.session.records import AngleSample, IntrinsicsSample, PoseSample
 from tests.formats.foxglove_protobuf import protobuf
 from tests.formats.log_values import (
     STORES,

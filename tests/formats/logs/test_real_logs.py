@@ -1,8 +1,5 @@
 """Real logs: `describe` and `messages` agree with the reference readers of the same files."""
 
-import json
-from typing import Any
-
 import pytest
 
 from pipelines.formats.logs import recordings
@@ -10,7 +7,7 @@ from pipelines.formats.logs.messages import bytes_of
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import FORMATS, LogFormat
 from tests.raising import refused
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 LOGS = {
     "logs/ros1/husky_gps_imu_odom.bag": "ros1",
@@ -37,11 +34,6 @@ UNDEFINED = {
 }
 # Their metadata.yaml states another time than their messages; the reference reader repeats it.
 WRONG_METADATA = {"logs/ros2/rosbag2_wbag_sqlite3", "logs/ros2/rosbag2_wbag_mcap"}
-
-
-def facts(path: str) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))[path]
-    return content
 
 
 def ros2_spelling(name: str) -> str:

@@ -9,11 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.logs.recordings import (
-    TAIL,
-    TRUNCATED,
-    UNCLOSED,
-)
+from pipelines.formats.logs.recordings import TAIL, TRUNCATED, UNCLOSED
 from pipelines.formats.logs.ros2_bag import MISSING_FILES, NOT_IN_FILES
 from tests.formats.log_entries import (
     OTHER,

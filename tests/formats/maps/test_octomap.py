@@ -1,6 +1,5 @@
 """OctoMap: trees written here by another algorithm than the reader's, and real maps with known contents."""
 
-import json
 import math
 import struct
 from typing import Literal
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipelines.formats.maps import octomap
 from pipelines.session.registries import MapFormat
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 READER: MapFormat = octomap.FORMAT
 FREE, OCCUPIED = np.float32(0.1192), np.float32(0.971)
@@ -151,12 +150,12 @@ def test_merged_voxels_keep_the_largest_probability(
 
 @pytest.mark.parametrize("name", ["octomap_geb079.bt", "octomap_simple.bt", "octomap_ecmrv4_withfree.ot"])
 def test_real_maps_are_read_as_by_octomap(name: str) -> None:
-    facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}"]
+    told = facts(f"maps/{name}")
     file = real_data(f"maps/{name}")
     assert READER.recognises(file)
     said = READER.describe(file)
-    assert said["occupied_voxels"] == facts["occupied_voxels_at_finest"]
-    assert said["free_voxels"] == facts["free_voxels_at_finest"]
-    assert said["resolution_m"] == facts["resolution"]
+    assert said["occupied_voxels"] == told["occupied_voxels_at_finest"]
+    assert said["free_voxels"] == told["free_voxels_at_finest"]
+    assert said["resolution_m"] == told["resolution"]
     for end in ("min", "max"):
-        assert said[f"box_{end}_m"] == pytest.approx(facts["metric_bbox"][end], abs=1e-9)
+        assert said[f"box_{end}_m"] == pytest.approx(told["metric_bbox"][end], abs=1e-9)

@@ -1,6 +1,5 @@
 """PCD in every encoding, with fields in any order and of any type, and real clouds."""
 
-import json
 import struct
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from pipelines.formats.maps.octree import decompress
 from pipelines.geometry.arrays import Float
 from pipelines.session.registries import MapFormat
 from tests.formats import clouds
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 READER: MapFormat = point_files.PCD
 
@@ -96,15 +95,15 @@ def test_lzf_reads_what_liblzf_wrote() -> None:
 
 @pytest.mark.parametrize("name", ["pcl_bunny_ascii", "pcl_colored_cloud", "ndt_omp_251370668"])
 def test_real_clouds_are_read_as_by_other_readers(name: str) -> None:
-    facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}.pcd"]
+    told = facts(f"maps/{name}.pcd")
     path = real_data(f"maps/{name}.pcd")
     assert READER.recognises(path)
     points = point_files.read_pcd(path)
     finite = points[np.isfinite(points).all(axis=1)]
-    assert (len(points), len(finite)) == (facts["points"], facts["finite_points"])
+    assert (len(points), len(finite)) == (told["points"], told["finite_points"])
     # Facts are rounded to 0.1 mm.
-    for found, told in ((finite.min(0), facts["bbox"]["min"]), (finite.max(0), facts["bbox"]["max"])):
-        assert found == pytest.approx(told, abs=1.01e-4)
-    assert finite.mean(axis=0) == pytest.approx(facts["centroid"], abs=1.01e-4)
+    for found, its in ((finite.min(0), told["bbox"]["min"]), (finite.max(0), told["bbox"]["max"])):
+        assert found == pytest.approx(its, abs=1.01e-4)
+    assert finite.mean(axis=0) == pytest.approx(told["centroid"], abs=1.01e-4)
     occupied = np.count_nonzero(READER.read_map(path).probability == 1)
     assert occupied == len(np.unique(np.floor(finite / 0.2), axis=0))

@@ -1,6 +1,5 @@
 """PLY in every encoding and byte order, clouds and meshes, and a real cloud."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from pipelines.formats.maps import point_files
 from pipelines.session.registries import MapFormat
 from tests.formats import clouds
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 READER: MapFormat = point_files.PLY
 
@@ -55,12 +54,12 @@ def test_voxels_hold_the_vertices(tmp_path: Path, encoding: str) -> None:
 
 
 def test_the_real_cloud_is_read_as_by_other_readers() -> None:
-    facts = json.loads(real_data("facts.json").read_text())["maps/small_gicp_target.ply"]
+    told = facts("maps/small_gicp_target.ply")
     path = real_data("maps/small_gicp_target.ply")
     points = point_files.read_ply(path)
     finite = points[np.isfinite(points).all(axis=1)]
-    assert (len(points), len(finite)) == (facts["points"], facts["finite_points"])
+    assert (len(points), len(finite)) == (told["points"], told["finite_points"])
     # Facts are rounded to 0.1 mm.
-    for found, told in ((finite.min(0), facts["bbox"]["min"]), (finite.max(0), facts["bbox"]["max"])):
-        assert found == pytest.approx(told, abs=1.01e-4)
-    assert finite.mean(axis=0) == pytest.approx(facts["centroid"], abs=1.01e-4)
+    for found, its in ((finite.min(0), told["bbox"]["min"]), (finite.max(0), told["bbox"]["max"])):
+        assert found == pytest.approx(its, abs=1.01e-4)
+    assert finite.mean(axis=0) == pytest.approx(told["centroid"], abs=1.01e-4)

@@ -1,6 +1,5 @@
 """Floor plans: map_server's rules on small pictures, turned plans, and the real ones."""
 
-import json
 import math
 import re
 from pathlib import Path
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from pipelines.formats.maps import ros_map
 from pipelines.session.registries import MapFormat
 from tests.raising import refused
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 READER: MapFormat = ros_map.FORMAT
 
@@ -118,10 +117,10 @@ def test_a_picture_outside_of_the_folder_is_named_in_full_or_not_at_all(tmp_path
 
 @pytest.mark.parametrize("name", ["nav2_depot", "nav2_testmap"])
 def test_real_plans_hold_the_pixels_of_their_pictures(tmp_path: Path, name: str) -> None:
-    facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}.pgm"]
+    told = facts(f"maps/{name}.pgm")
     path = real_data(f"maps/{name}.yaml")
     assert READER.recognises(path)
-    plan = facts["yaml"]
+    plan = told["yaml"]
     unturned = re.sub(r"(?m)^(origin: .*),.*\]", r"\1, 0.0]", path.read_text(encoding="utf-8"))
     (tmp_path / "a.yaml").write_text(
         re.sub(r"(?m)^image: .*", f"image: {path.with_suffix('.pgm')}", unturned)
@@ -130,7 +129,7 @@ def test_real_plans_hold_the_pixels_of_their_pictures(tmp_path: Path, name: str)
     assert occupancy.resolution_m == plan["resolution"]
     assert occupancy.origin[:2].tolist() == plan["origin"][:2]
     floor_of = occupancy.probability[:, :, 0]
-    assert floor_of.shape == (facts["width"], facts["height"])
+    assert floor_of.shape == (told["width"], told["height"])
     states = {"occupied": floor_of >= 0.5, "free": floor_of < 0.5, "unknown": np.isnan(floor_of)}
     for state, pixels in states.items():
-        assert np.count_nonzero(pixels) == facts[f"trinary_{state}"]
+        assert np.count_nonzero(pixels) == told[f"trinary_{state}"]

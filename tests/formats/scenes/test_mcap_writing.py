@@ -13,14 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from pipelines.formats.common.exporting import CHI2_95
 from pipelines.formats.scenes import mcap_writing
 from pipelines.session.registries import Export
-from tests.formats.exported import (
-    LENS,
-    LOOKING_NORTH,
-    SIGMA_M,
-    flown,
-    recording,
-    stamps,
-)
+from tests.formats.exported import LENS, LOOKING_NORTH, SIGMA_M, flown, recording, stamps
 
 WRITER: Export = mcap_writing.EXPORT
 LINE_LIST, SPHERE_LIST, DELETE_ALL = 5, 7, 3

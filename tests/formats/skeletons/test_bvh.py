@@ -1,6 +1,7 @@
-"""BVH: small files whose joints can be computed on paper, and real ones with reference values."""
+"""BVH: small files whose joints can be computed on paper, real ones, and rigs that were written."""
 
-import json
+import re
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 
@@ -10,13 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.formats.skeletons import bvh
-from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.formats.skeletons.bvh import fit_rig, read_motion
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, multiply, rotate
-from pipelines.session.records import SkeletalMotion
-from pipelines.session.registries import JointFormat
+from pipelines.session.people import take_joints, with_derived
+from pipelines.session.records import JointMotion, SkeletalMotion
+from pipelines.session.registries import ExportWithChoices, JointFormat
+from tests.formats.exported import Listener, recording, walking, without
 from tests.raising import refused
-from tests.real_data import real_data
+from tests.real_data import facts, real_data
 
 READER: JointFormat = bvh.FORMAT
 
@@ -167,16 +170,16 @@ def test_faulty_content_is_refused(tmp_path: Path, code: str, text: str) -> None
 
 @pytest.mark.parametrize("name", ["cmu_10_04_walk", "cmu_10_01_soccer_kick", "xia_neutral_01_000"])
 def test_real_files_hold_what_others_read(name: str) -> None:
-    facts = json.loads(real_data("facts.json").read_text())[f"motion/{name}.bvh"]
+    told = facts(f"motion/{name}.bvh")
     path = real_data(f"motion/{name}.bvh")
     assert READER.recognises(path)
     motion = read_motion(path, unit="m", axes="y-up")
-    assert (len(motion.bones), len(motion.t_s)) == (facts["joints"], facts["frames"])
-    assert list(motion.bones) == facts["joint_names"]
-    assert 1 / motion.t_s[1] == pytest.approx(facts["fps"], rel=1e-4)
+    assert (len(motion.bones), len(motion.t_s)) == (told["joints"], told["frames"])
+    assert list(motion.bones) == told["joint_names"]
+    assert 1 / motion.t_s[1] == pytest.approx(told["fps"], rel=1e-4)
     place, _ = joint_places(motion)
     in_file = place[..., [1, 2, 0]]
-    for joint, frames in facts["fk_positions"].items():
+    for joint, frames in told["fk_positions"].items():
         for frame, expected in frames.items():
             found = in_file[int(frame.removeprefix("frame_")), motion.bones.index(joint)]
             np.testing.assert_allclose(found, expected, rtol=0, atol=6e-5)  # references have 4 decimals
@@ -185,11 +188,63 @@ def test_real_files_hold_what_others_read(name: str) -> None:
 @pytest.mark.parametrize("name", ["cmu_10_04_walk", "cmu_10_01_soccer_kick"])
 def test_real_joints_are_where_others_find_them(name: str) -> None:
     """Find CMU's unit, 0.0254 / 0.45 m, by the height of the rest pose; joints have our names."""
-    facts = json.loads(real_data("facts.json").read_text())[f"motion/{name}.bvh"]["fk_positions"]
+    told = facts(f"motion/{name}.bvh")["fk_positions"]
     truth = READER.read_joints(real_data(f"motion/{name}.bvh"), unit=None, axes=None)
     for bone, joint in {"LeftHand": "left_wrist", "RightFoot": "right_ankle", "Head": "Head"}.items():
-        for frame, expected in facts[bone].items():
+        for frame, expected in told[bone].items():
             found = truth.position[int(frame.removeprefix("frame_")), 0, truth.joints.index(joint)]
             expected_m = np.array(expected)[[2, 0, 1]] * 0.0254 / 0.45
             np.testing.assert_allclose(found, expected_m, rtol=0, atol=6e-5)
     assert truth.t_ns[1] == 8_333_300 or abs(int(truth.t_ns[1]) - 8_333_333) < 1000
+
+
+WRITER: ExportWithChoices = bvh.EXPORT
+WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centimetre: 0.04 micrometres
+
+
+def measured(motion: JointMotion, joints: tuple[str, ...]) -> Float:
+    """Return the measured positions [T, B, 3] of a rig's joints; the hip is the middle of the hips."""
+    return take_joints(*with_derived(motion.joints, motion.position[:, 0])[::-1], joints)
+
+
+def test_a_body_of_rigid_bones_is_followed_exactly() -> None:
+    motion = walking(90)
+    rigged = fit_rig("x", motion, 0)
+    assert rigged.motion.bones[:4] == ("Hips", "Spine", "Neck", "Head")
+    np.testing.assert_allclose(
+        joint_places(rigged.motion)[0], measured(motion, rigged.joints), rtol=0, atol=1e-9
+    )
+    assert (rigged.first, rigged.without_hips, rigged.turns_held) == (0, 0, 0)
+
+
+def test_bones_have_their_median_length_and_point_where_they_were_measured() -> None:
+    motion = walking(61)
+    forearm = [motion.joints.index(f"left_{joint}") for joint in ("elbow", "wrist")]
+    elbow, wrist = (motion.position[:, 0, k].copy() for k in forearm)
+    length = np.linalg.norm(wrist[0] - elbow[0])
+    stretch = np.linspace(0.5, 1.5, 61)  # the median is 1
+    motion.position[:, 0, forearm[1]] = elbow + stretch[:, None] * (wrist - elbow)
+    rigged = fit_rig("x", motion, 0)
+    place, _ = joint_places(rigged.motion)
+    hand, arm = rigged.motion.bones.index("LeftHand"), rigged.motion.bones.index("LeftForeArm")
+    bone = place[:, hand] - place[:, arm]
+    np.testing.assert_allclose(np.linalg.norm(bone, axis=1), length, rtol=1e-12)
+    np.testing.assert_allclose(bone / length, (wrist - elbow) / length, rtol=0, atol=1e-9)
+
+
+def test_what_is_missing_is_held_left_out_and_counted(tmp_path: Path) -> None:
+    motion = without(walking(30), "left_hip", [0, 1, 10, 29])
+    without(motion, "right_wrist", [15, 16])
+    listener = Listener()
+    (path,) = WRITER.write(replace(recording(), motion=motion, progress=listener), tmp_path)
+    back = read_motion(path, unit="cm", axes="y-up")
+    assert len(back.t_s) == 27
+    place, _ = joint_places(back)
+    np.testing.assert_allclose(place[8, 0], place[7, 0], atol=WRITTEN_M)  # frame 10 keeps the place of 9
+    forearm = back.bones.index("RightForeArm")
+    np.testing.assert_allclose(back.rotation[13, forearm], back.rotation[12, forearm], atol=1e-7)
+    np.testing.assert_allclose(back.rotation[14, forearm], back.rotation[12, forearm], atol=1e-7)
+    (note,) = listener.notes
+    # Frames before and after the hips are seen; frames without hips; held turns of bones.
+    # Frame 10: the turns of hips, spine and left thigh; 15 and 16: the forearm. 13 bones have a direction.
+    assert re.findall(r"(\d+) of (\d+)", note) == [("3", "30"), ("1", "27"), ("5", "351")]

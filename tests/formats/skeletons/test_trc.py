@@ -122,9 +122,6 @@ def opensim() -> Any:
     return library
 
 
-_FIRST, _MIDDLE, _LAST, _FRAMES = (slice(None), 0), (slice(None), 1), (slice(None), 2), slice(1, 3)
-
-
 def test_spellings_of_other_programs(tmp_path: Path) -> None:
     rows = "1\t0.0\t1.5\t2\t3\t4\t5\t6\n2\t0.1\t1.5\t2\t3\t\t\t\n"
     expected = read(write(tmp_path, HEADER + rows)).position

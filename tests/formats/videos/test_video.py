@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import cv2
@@ -18,15 +17,7 @@ from pipelines.session.records import UNTIMED
 from pipelines.session.registries import VideoFormat
 from tests.raising import refused
 from tests.real_data import real_data
-from tests.synthetic.videos import (
-    SIZE,
-    TICK_S,
-    bar_code,
-    even_ticks,
-    read_bar_code,
-    uneven_ticks,
-    write_video,
-)
+from tests.synthetic.videos import SIZE, TICK_S, even_ticks, read_bar_code, uneven_ticks, write_video
 
 READER: VideoFormat = video.FORMAT
 
@@ -198,41 +189,6 @@ def test_a_cut_mp4_is_salvaged_and_its_losses_are_counted(tmp_path: Path, share:
         assert reader.missing == set()
     described = READER.describe(path)
     assert [value for key, value in described.items() if key.startswith("dropped")] == [60 - count]
-
-
-@pytest.mark.parametrize(
-    ("suffix", "codec"),
-    [
-        (".flv", "libx264"),
-        (".nut", "libx264"),
-        (".mpg", "mpeg2video"),
-        (".wmv", "wmv2"),
-        (".ivf", "libvpx"),
-        (".ogv", "libvpx"),
-        (".mxf", "mpeg2video"),
-        (".y4m", "wrapped_avframe"),
-    ],
-)
-def test_more_containers_that_ffmpeg_reads(tmp_path: Path, suffix: str, codec: str) -> None:
-    path = tmp_path / f"v{suffix}"
-    try:
-        with av.open(str(path), "w") as container:
-            stream: Any = container.add_stream(codec, rate=30)
-            stream.width, stream.height, stream.pix_fmt = (
-                bar_code(0).shape[1],
-                bar_code(0).shape[0],
-                "yuv420p",
-            )
-            for k in range(12):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(bar_code(k), format="rgb24")))
-            container.mux(stream.encode(None))
-    except (av.error.FFmpegError, ValueError) as error:
-        pytest.skip(f"this FFmpeg does not write {suffix} ({error})")
-    assert recognise(path, VideoFormat, "video").name == "video"
-    index = READER.index(path)
-    np.testing.assert_allclose(np.diff(index.pts_ns), 1e9 / 30, atol=1e6)
-    assert [read_bar_code(picture) for _, picture in frames(path)] == list(range(index.count))
-    assert index.count in {11, 12}  # a container may lose the length of its last picture
 
 
 def remuxed(path: Path, source: Path, pts_of: Callable[[int, int], int | None]) -> Path:

@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.rig import BONES, BodyMotion, Rig
-from pipelines.simulation.body import make_body
-from pipelines.simulation.scenario import Body
+from pipelines.geometry.rig import BodyMotion, Rig
 from tests.simulation.motion.performing import (
     RIG,
-    angles_of_leg_deg,
     bent_deg,
     clearance_m,
     flat,
@@ -99,28 +96,6 @@ def test_walking_angles_lie_in_the_published_bands(speed: float, side: int) -> N
     # A stride of 2 x 0.384 v m: the walk ratio of Sekiya & Nagasaki 1998; a frame is 0.2 % of it.
     stride_m = (stride.stop - stride.start) * 0.002 * speed
     assert stride_m == pytest.approx(2 * np.sqrt(0.384 * speed), rel=0.005)
-
-
-@pytest.mark.parametrize("sex", ["female", "male"])
-def test_what_the_camera_sees_of_a_walker_is_in_the_bands(sex: str) -> None:
-    """Hips, knees and ankles of the mesh, as annotators place them; a stand is straight.
-
-    At the usual speed of legs of that length (equal v^2 / g l).
-    """
-    person = make_body(Body.model_validate({"sex": sex}))
-    speed = 1.3 * np.sqrt(person.rig.length_of_leg / RIG.length_of_leg)
-    motion = performed(
-        {"walk": {"distance_m": 9 * speed, "speed_mps": speed}}, seconds=7.0, step_s=0.004, rig=person.rig
-    )
-    still = BodyMotion(np.zeros(1), person.rig.offset[:1], np.tile([0.0, 0.0, 0.0, 1.0], (1, len(BONES), 1)))
-    legs = [person.joints.index(f"left_{joint}") for joint in ("hip", "knee", "ankle")]
-    straight, seen = (
-        angles_of_leg_deg(*np.moveaxis(person.keypoints(each)[:, legs], 1, 0)) for each in (still, motion)
-    )
-    stride, toe_off = stride_of(motion, 0, person.rig)
-    angles = {joint: curve[stride] - straight[joint] for joint, curve in seen.items()}
-    bent = [event for event in EVENTS if event.joint in angles]
-    assert all((within := published(angles, toe_off, bent)).values()), within
 
 
 def test_a_jog_flies_and_bends_its_knees_as_published() -> None:

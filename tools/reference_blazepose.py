@@ -3,7 +3,7 @@
 It needs its own environment, because mediapipe 0.10.21 is not compatible with ours:
 
     python3.11 -m venv /tmp/reference && /tmp/reference/bin/pip install mediapipe==0.10.21
-    /tmp/reference/bin/python tests/keypoints/make_reference_blazepose.py FOLDER_OF_VIDEOS
+    /tmp/reference/bin/python tools/reference_blazepose.py FOLDER_OF_VIDEOS
 
 The videos are those of the Pose2Sim single-person demo (BSD-3), as they come in its package.
 """
@@ -35,7 +35,7 @@ SETTINGS = {
 def main(folder: Path) -> None:
     frames = [frame_of(folder / video, frame) for video in VIDEOS for frame in FRAMES]
     origin = {
-        "made_by": "tests/keypoints/make_reference_blazepose.py",
+        "made_by": "tools/reference_blazepose.py",
         "mediapipe": mediapipe.__version__,
         "graph": GRAPH,
         "settings": SETTINGS,
@@ -43,7 +43,7 @@ def main(folder: Path) -> None:
         "numbers": "MediaPipe's shares of the picture times its width or height; regions: x, y, side, angle",
     }
     lines = ",\n".join(json.dumps(frame) for frame in frames)
-    target = Path(__file__).with_name("reference_blazepose.json")
+    target = Path(__file__).parents[1] / "tests" / "keypoints" / "reference_blazepose.json"
     target.write_text(f'{{"origin": {json.dumps(origin)},\n"frames": [\n{lines}\n]}}\n')
 
 
