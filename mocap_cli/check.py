@@ -1,12 +1,11 @@
 """`mocap check`: whether a flight's description, logs and pictures fit together."""
 
-import os
 from pathlib import Path
 from typing import Any
 
 import click
 
-from mocap_cli.options import Shown, output_options
+from mocap_cli.options import Shown, cores_option, output_options
 from mocap_cli.several import each
 from mocap_cli.terminal import say, say_warnings, watching
 from pipelines.session.errors import DataError
@@ -20,22 +19,10 @@ from pipelines.session.errors import DataError
 @click.option("--detector", default="blazepose", show_default=True, help="See `mocap models`.")
 @click.option("--strict", is_flag=True, help="Exit 1 if there is a doubt.")
 @click.option("--fix", is_flag=True, help="Write the remedies that were tried into flight.yaml.")
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 256),
-    default=lambda: os.cpu_count() or 1,
-    show_default="all cores",
-    help="Threads; the result does not depend on them.",
-)
+@cores_option
 @output_options
 def check_command(
-    path: Path,
-    pose_noise: str | None,
-    detector: str,
-    strict: bool,
-    fix: bool,
-    workers: int,
-    shown: Shown,
+    path: Path, pose_noise: str | None, detector: str, strict: bool, fix: bool, workers: int, shown: Shown
 ) -> dict[str, Any] | None:
     """Find mistakes in a flight.yaml and show the line to change.
 

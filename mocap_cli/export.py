@@ -34,11 +34,7 @@ class _ListsFormats(click.Command):
 @click.command("export", cls=_ListsFormats, short_help="Write TRC, C3D, BVH, CSV, MCAP, missions.")
 @each("session", "SESSION", suffix=".export")
 @click.option(
-    "--to",
-    "formats",
-    required=True,
-    metavar="FORMAT[,FORMAT...]",
-    help="Formats to write, as listed below.",
+    "--to", "formats", required=True, metavar="FORMAT[,FORMAT...]", help="Formats to write, as listed below."
 )
 @click.option(
     "-o",

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,17 +133,19 @@ def scheduler_option(help_text: str) -> Option:
     )
 
 
+cores_option = click.option(
+    "--workers",
+    type=click.IntRange(1, 256),
+    default=lambda: os.cpu_count() or 1,
+    show_default="all cores",
+    help="Threads and processes; the result does not depend on them.",
+)
+
+
 def workers_option(help_text: str) -> Callable[[Command], Command]:
     """Make the option --workers of a simulation; two by default."""
     return click.option(
         "--workers", type=click.IntRange(1, 256), default=2, show_default=True, help=help_text
-    )
-
-
-def seed_option(help_text: str) -> Callable[[Command], Command]:
-    """Make the option --seed of random numbers."""
-    return click.option(
-        "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help=help_text
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable
 from contextlib import ExitStack
@@ -15,6 +14,7 @@ from mocap_cli.options import (
     FiniteRange,
     Shown,
     any_path,
+    cores_option,
     force_option,
     grouped,
     output_options,
@@ -125,13 +125,7 @@ _settings_options = grouped(
     help="Work on a copy of the session there [default: in the session]; videos stay where they are.",
 )
 @_settings_options
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 256),
-    default=lambda: os.cpu_count() or 1,
-    show_default="all cores",
-    help="Threads and processes; the result does not depend on them.",
-)
+@cores_option
 @scheduler_option("Give the pictures, and a long flight, to the Dask cluster there, in parts.")
 @force_option
 @output_options

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mocap_cli.options import Shown, force_option, grouped, output_options, seed_option
+from mocap_cli.options import Shown, force_option, grouped, output_options
 from mocap_cli.several import each
 from mocap_cli.terminal import print_table, say, say_warnings, watching
 
@@ -52,7 +52,9 @@ _settings_options = grouped(
         show_default=True,
         help="Draws of detector and pose noise for the reconstruction error.",
     ),
-    seed_option("Seed of all noise."),
+    click.option(
+        "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Seed of all noise."
+    ),
     click.option(
         "--pose-noise",
         metavar="MODEL",

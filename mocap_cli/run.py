@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mocap_cli.options import Shown, any_path, output_options
+from mocap_cli.options import Shown, any_path, cores_option, output_options
 from mocap_cli.reconstruct import print_verdict
 from mocap_cli.terminal import one_line, print_json, say, say_warnings, watching
 from pipelines.session.errors import DataError
@@ -24,13 +23,7 @@ MAX_QUESTIONS = 3
 @click.command("run", short_help="Go from a folder to the verdict in one command.")
 @click.argument("folder", type=any_path, metavar="FOLDER|FLIGHT.yaml")
 @click.option("--yes", is_flag=True, help="Take the likely answer to every question.")
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 256),
-    default=lambda: os.cpu_count() or 1,
-    show_default="all cores",
-    help="As of `mocap reconstruct`; the result does not depend on it.",
-)
+@cores_option
 @output_options
 def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
     """Draft the flight.yaml of a folder, then ingest, reconstruct, replan and report the flight.

@@ -27,22 +27,15 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
             found[Path(text)] = None
             continue
         if is_url(text):
-            found.update(dict.fromkeys(map(Path, _matching(text))))
-            continue
-        matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207  # Path's knows no absolute pattern
+            from pipelines.session.urls import matching, url_of
+
+            matches = matching(url_of(text) or text)
+        else:
+            matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207  # Path's knows no absolute one
         if not matches:
             raise DataError(text, "matches nothing", "check the pattern", code="no-such-file")
         found.update(dict.fromkeys(map(Path, matches)))
     return list(found)
-
-
-def _matching(pattern: str) -> list[str]:
-    from pipelines.session.urls import matching, url_of
-
-    found = matching(url_of(pattern) or pattern)
-    if not found:
-        raise DataError(pattern, "matches nothing", "check the pattern", code="no-such-file")
-    return found
 
 
 def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -123,9 +116,8 @@ def _outputs(paths: list[Path], folder: Path | None, suffix: str) -> list[Path |
         return [None] * len(paths)
     if folder.is_file() or (folder / "session.json").exists():
         what = "a file" if folder.is_file() else "a session"
-        raise DataError(
-            folder, f"is {what}: several need a folder around them all", "give another --output, or none"
-        )
+        problem = f"is {what}: several need a folder around them all"
+        raise DataError(folder, problem, "give another --output, or none")
     from pipelines.session.stages import names_of
 
     return [folder / f"{name}{suffix}" for name in names_of(paths)]

@@ -119,9 +119,8 @@ def batch(
     settings, progress = settings or BatchSettings(), progress or Silent()
     unknown = [stage for stage in settings.stages if stage not in STAGES]
     if unknown:
-        raise DataError(
-            f"--stages {unknown[0]}", "no such stage", f"there are {', '.join(STAGES)}", code="no-such-name"
-        )
+        problem, remedy = "no such stage", f"there are {', '.join(STAGES)}"
+        raise DataError(f"--stages {unknown[0]}", problem, remedy, code="no-such-name")
     need("distributed", "batch")
     flights = list({path.resolve(): path for path in flights}.values())
     folder = output or Path(_FOLDER)

@@ -120,18 +120,11 @@ def _checked(
 
 
 def _doubts(
-    session: Session,
-    description: Description,
-    detected: StageRecord | None,
-    pose_noise: str | None,
+    session: Session, description: Description, detected: StageRecord | None, pose_noise: str | None
 ) -> list[Doubt]:
     folder = session.folder
     cameras, _ = load_cameras(
-        folder,
-        description,
-        detected,
-        min_confidence=MIN_CONFIDENCE,
-        pose_noise=pose_noise,
+        folder, description, detected, min_confidence=MIN_CONFIDENCE, pose_noise=pose_noise
     )
     actors = logged_people(folder, description)
     found, association, _ = find_people(cameras, description.pose_interpolation, actors)

@@ -275,11 +275,7 @@ class _Work:
     """Data that all blocks of a session share."""
 
     def __init__(
-        self,
-        folder: Path,
-        description: Description,
-        every: int,
-        span_s: tuple[float | None, float | None],
+        self, folder: Path, description: Description, every: int, span_s: tuple[float | None, float | None]
     ) -> None:
         self.folder = folder
         self.every = every
@@ -580,11 +576,7 @@ def follow(
 
 
 def _blocks_to_follow(
-    folder: Path,
-    description: Description,
-    camera: str,
-    every: int,
-    span_s: tuple[float | None, float | None],
+    folder: Path, description: Description, camera: str, every: int, span_s: tuple[float | None, float | None]
 ) -> list[FollowedBlock]:
     frames = read_table(folder / "cameras" / camera / "frames.parquet", FRAMES)
     numbers, t_ns = (frames[name].to_numpy(np.int64) for name in ("frame", "t_ns"))

@@ -150,9 +150,8 @@ def draft(
     things, home = search.look([_absolute(path) for path in paths])
     target = output or home / "flight.yaml"
     if target.exists() and not overwrite:
-        raise DataError(
-            target, "exists", "choose another with --output, or replace it with --overwrite", code="exists"
-        )
+        problem, remedy = "exists", "choose another with --output, or replace it with --overwrite"
+        raise DataError(target, problem, remedy, code="exists")
     progress = progress or Silent()
     progress.start("Reading", len(things))
     found: list[Proposal | FoundLog] = []

@@ -646,12 +646,7 @@ def clocks_of(
     questioned_s = np.where(exact, QUESTIONED_SIGMA_S, prior_s)
     if flight.followed and questioned_s.any():
         offset_s, sigma_s = clocks_of_backgrounds(
-            cameras,
-            flight.followed,
-            flight.errors(cameras),
-            questioned_s,
-            exact,
-            between=flight.between,
+            cameras, flight.followed, flight.errors(cameras), questioned_s, exact, between=flight.between
         )
         wrong = exact & is_wrong(np.nan_to_num(offset_s), np.nan_to_num(sigma_s))
         held = exact & ~wrong

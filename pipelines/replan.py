@@ -264,9 +264,8 @@ def refuse_unknown(arms: Sequence[str], *, logged: bool = True) -> None:
     known = [*PLANNER_ARMS.names(), *(LOGGED if logged else ())]
     for arm in arms:
         if arm not in known:
-            raise DataError(
-                f"--arms {arm}", "no such planner arm", f"there are {', '.join(known)}", code="no-such-name"
-            )
+            problem = "no such planner arm"
+            raise DataError(f"--arms {arm}", problem, f"there are {', '.join(known)}", code="no-such-name")
 
 
 def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> list[str]:
@@ -280,9 +279,8 @@ def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> 
             *([PLANNED] if flight.planned else []),
         ]
     if FLOWN in asked and not flight.moves:
-        raise DataError(
-            folder, "has no flight to compare with: its cameras stand still", f"leave {FLOWN} out"
-        )
+        problem = "has no flight to compare with: its cameras stand still"
+        raise DataError(folder, problem, f"leave {FLOWN} out")
     if PLANNED in asked and not flight.planned:
         problem = "holds no commands of a planner on board"
         raise DataError(folder, problem, f"name them under `plan:`, or leave {PLANNED} out")
@@ -313,10 +311,7 @@ def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
     np.save(folder / "known.npy", flown.known)
     np.save(folder / "aim.npy", flown.aim)
-    facts: dict[str, object] = {
-        "safety": flown.safety,
-        "joint_frames": 0,
-    }
+    facts: dict[str, object] = {"safety": flown.safety, "joint_frames": 0}
     if measured is not None:
         np.save(folder / "error_m.npy", measured.error_m)
         facts |= {"joint_frames": measured.joint_frames}
@@ -330,10 +325,7 @@ def read_result(folder: Path) -> ArmResult:
     errors = folder / "error_m.npy"
     return ArmResult(
         flight=flight_from(
-            table,
-            np.load(folder / "aim.npy"),
-            np.load(folder / "known.npy"),
-            facts["safety"],
+            table, np.load(folder / "aim.npy"), np.load(folder / "known.npy"), facts["safety"]
         ),
         error_m=np.load(errors, mmap_mode="r") if errors.exists() else None,  # large in long flights
         joint_frames=facts["joint_frames"],

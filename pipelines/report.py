@@ -250,9 +250,8 @@ def read_study(folder: Path) -> StudyContent:
         study = StudyContent(metrics, shlex.join(words), sha256_of(folder / "metrics.json"))
         study_blocks(study, draw_study("study", metrics))
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            folder / "metrics.json", "is not the result of a study", remedy, code="wrong-kind"
-        ) from error
+        problem = "is not the result of a study"
+        raise DataError(folder / "metrics.json", problem, remedy, code="wrong-kind") from error
     return study
 
 

@@ -134,11 +134,7 @@ def _refuse_to_lose_others(folder: Path) -> None:
 
 def _key(scenario: Scenario, path: Path, video: bool) -> str:
     """Compute the key of a simulation; it is equal for equal flights."""
-    ingredients: dict[str, object] = {
-        "revision": _REVISION,
-        "scenario": scenario.identity(),
-        "video": video,
-    }
+    ingredients: dict[str, object] = {"revision": _REVISION, "scenario": scenario.identity(), "video": video}
     if not video:
         ingredients["errors"] = sha256_of(errors_of(scenario.keypoints.detector))
     if hashes := {name: sha256_of(file) for name, (file, _) in scenario.motion_files(path.parent).items()}:
@@ -162,9 +158,8 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
     if formation.planner not in PLANNER_ARMS.names():
         known = ", ".join([_RING, *PLANNER_ARMS.names()])
         place = f"{path}: drones.formation.planner"
-        raise DataError(
-            place, f"no such planner {formation.planner!r}", f"there are {known}", code="no-such-name"
-        )
+        problem = f"no such planner {formation.planner!r}"
+        raise DataError(place, problem, f"there are {known}", code="no-such-name")
     if formation.yaw_rate_deg_per_s or formation.variation:
         problem = f"yaw_rate_deg_per_s and variation are the ring's, {formation.planner} turns as it decides"
         raise DataError(f"{path}: drones.formation", problem, "leave them out, or take planner: ring")

@@ -264,12 +264,7 @@ def _study_walk(
 
 
 def _measure_condition(
-    settings: WalkStudy,
-    filmed: Walk,
-    condition: _Condition,
-    halt: Halt,
-    progress: Progress,
-    folder: Path,
+    settings: WalkStudy, filmed: Walk, condition: _Condition, halt: Halt, progress: Progress, folder: Path
 ) -> None:
     cameras = formation(filmed, cameras=condition.robots, tilt_deg=condition.tilt_deg)
     exact = exact_keypoints(filmed, cameras)

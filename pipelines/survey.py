@@ -115,15 +115,13 @@ def _described(
 ) -> dict[str, Any]:
     schema = summary.get("schema")
     if isinstance(schema, int) and schema > SCHEMA:
-        raise DataError(
-            file, f"has schema {schema}, newer than {SCHEMA}", "update mocap to read it", code="newer-schema"
-        )
+        problem = f"has schema {schema}, newer than {SCHEMA}"
+        raise DataError(file, problem, "update mocap to read it", code="newer-schema")
     try:
         return reader(summary)
     except (KeyError, TypeError, AttributeError):
-        raise DataError(
-            file, "lacks what it should hold", "make the folder again", code="wrong-kind"
-        ) from None
+        problem = "lacks what it should hold"
+        raise DataError(file, problem, "make the folder again", code="wrong-kind") from None
 
 
 def _of_simulation(summary: Mapping[str, Any]) -> dict[str, Any]:

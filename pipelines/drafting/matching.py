@@ -138,10 +138,7 @@ class CameraDraft:
     def mentioned(self) -> list[Proposal]:
         """List every candidate that the manifest mentions for it, also those in comments."""
         choices = [*self.choices.values(), *([self.true_poses] if self.true_poses else [])]
-        listed = [
-            *self.pictures["video"],
-            *self.pictures["keypoints"],
-        ]
+        listed = [*self.pictures["video"], *self.pictures["keypoints"]]
         return listed + [c for choice in choices for c in (choice.taken, *choice.others)]
 
 
@@ -160,11 +157,7 @@ class FlightDraft:
 
 
 def match(
-    found: Sequence[Proposal],
-    recordings: Sequence[FoundLog],
-    compare: Compare,
-    distance: Distance,
-    ask: Ask,
+    found: Sequence[Proposal], recordings: Sequence[FoundLog], compare: Compare, distance: Distance, ask: Ask
 ) -> FlightDraft:
     """Find the cameras, and what belongs to each.
 

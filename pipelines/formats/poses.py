@@ -121,9 +121,8 @@ def clean_poses(
     keep = kept_rows(t_ns, causes, dropped)
     if not keep.any():
         counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
-        raise DataError(
-            source, f"holds no usable pose ({counts})", "check how it was written", code="no-poses"
-        )
+        problem = f"holds no usable pose ({counts})"
+        raise DataError(source, problem, "check how it was written", code="no-poses")
     return Trajectory(
         t_ns=t_ns[keep],
         position=position[keep],
@@ -275,9 +274,8 @@ class TumExport:
             write_tum(path, trajectory)
             paths.append(path)
         if not paths:
-            raise DataError(
-                recording.name, "holds neither camera poses nor joints", "ingest or reconstruct it first"
-            )
+            problem = "holds neither camera poses nor joints"
+            raise DataError(recording.name, problem, "ingest or reconstruct it first")
         return sorted(paths)
 
 

@@ -32,14 +32,7 @@ _STANDING_M_S = 0.3
 # Foot sliding is stated in millimetres for each picture of a 30 Hz film (WHAM).
 _FIELD_RATE_HZ = 30.0
 
-WORLD_ERRORS = (
-    "w_mpjpe_mm",
-    "wa_mpjpe_mm",
-    "rte_percent",
-    "jitter",
-    "foot_sliding_mm",
-    "shifted_mpjpe_mm",
-)
+WORLD_ERRORS = ("w_mpjpe_mm", "wa_mpjpe_mm", "rte_percent", "jitter", "foot_sliding_mm", "shifted_mpjpe_mm")
 """The errors of `world_errors`."""
 
 

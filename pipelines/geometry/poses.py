@@ -276,11 +276,7 @@ _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def carried_covariance(
-    covariance: Float,
-    *,
-    position_xyzw: Float = _NO_TURN,
-    rotation_xyzw: Float = _NO_TURN,
-    scale: float = 1.0,
+    covariance: Float, *, position_xyzw: Float = _NO_TURN, rotation_xyzw: Float = _NO_TURN, scale: float = 1.0
 ) -> Float:
     """Transform covariances [..., 6, 6] of poses by rotations of the axes of positions and of rotations.
 

@@ -167,9 +167,8 @@ def read_grid(path: Path) -> Occupancy:
     except DataError:
         raise
     except _DAMAGED as error:
-        raise DataError(
-            path, f"is no readable npz ({str(error)[:200]})", _WRITE_AGAIN, code="damaged"
-        ) from error
+        problem = f"is no readable npz ({str(error)[:200]})"
+        raise DataError(path, problem, _WRITE_AGAIN, code="damaged") from error
 
 
 def _read(path: Path, archive: zipfile.ZipFile) -> Occupancy:

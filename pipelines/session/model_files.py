@@ -166,13 +166,12 @@ class PackagedModels:
             reason = (errors or [f"it exited with {done.returncode}"])[0]
         except OSError as error:
             reason = f"{error.filename} is not installed"
-        raise DataError(
-            self.detector,
-            f"its model files could not be downloaded ({reason})",
+        remedy = (
             f"connect to the network, or run `mocap models fetch {self.detector} --from PATH` with the"
             f" {package.name} {package.version} {package.noun} or a folder that holds"
-            f" {' and '.join(file.name for file in self.files)}",
+            f" {' and '.join(file.name for file in self.files)}"
         )
+        raise DataError(self.detector, f"its model files could not be downloaded ({reason})", remedy)
 
     def _is_good(self, file: ModelFile) -> bool:
         path = self.folder / file.name
@@ -192,22 +191,20 @@ class PackagedModels:
                     name = file.name if source.is_dir() else file.member
                     raise DataError(source, f"holds no {name}", f"give the {noun} or the folder that does")
                 if (found := hashlib.sha256(contents[file]).hexdigest()) != file.sha256:
-                    raise DataError(
-                        source,
+                    problem = (
                         f"its {file.name} is not the one that was expected (SHA-256 {found[:8]}..., "
-                        f"not {file.sha256[:8]}... of {file.size} bytes)",
-                        "give the one of the version that was asked for",
-                        code="wrong-model",
+                        f"not {file.sha256[:8]}... of {file.size} bytes)"
                     )
+                    remedy = "give the one of the version that was asked for"
+                    raise DataError(source, problem, remedy, code="wrong-model")
             make_folder(self.folder)
             for file in wanted:
                 write_whole(self.folder / file.name, contents[file])
         except OSError as error:
             raise as_data_error(error, source) from error
         except (tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
-            raise DataError(
-                source, f"is no readable {noun} ({error})", "download it again", code="damaged"
-            ) from None
+            problem = f"is no readable {noun} ({error})"
+            raise DataError(source, problem, "download it again", code="damaged") from None
 
 
 def find_file(folder: Path, name: str) -> Path | None:

@@ -392,9 +392,8 @@ def need(module: str, extra: str) -> Any:
             warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's wrappers deprecate themselves
             return import_module(module)
     except ImportError as error:
-        raise DataError(
-            module, "is not installed", f"run `{install_command(extra)}`", code="missing-library"
-        ) from error
+        problem = "is not installed"
+        raise DataError(module, problem, f"run `{install_command(extra)}`", code="missing-library") from error
 
 
 def install_command(extra: str) -> str:

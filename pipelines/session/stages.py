@@ -293,12 +293,7 @@ class WritableSession(Session):
     """A session that no other process writes; `locked` makes it."""
 
     def begin(
-        self,
-        stage: Stage,
-        *,
-        settings: Mapping[str, object],
-        inputs: Mapping[str, str],
-        force: bool = False,
+        self, stage: Stage, *, settings: Mapping[str, object], inputs: Mapping[str, str], force: bool = False
     ) -> Run:
         """Begin a stage, or find it finished with the same settings and inputs, and undamaged.
 
@@ -503,9 +498,8 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
 def _check_session(folder: Path) -> None:
     path = folder / "session.json"
     if not path.is_file():
-        raise DataError(
-            folder, "is not a session", "make one with `mocap ingest FLIGHT.yaml`", code="not-a-session"
-        )
+        problem = "is not a session"
+        raise DataError(folder, problem, "make one with `mocap ingest FLIGHT.yaml`", code="not-a-session")
     remedy = "run `mocap ingest` again"
     refuse_newer(path, read_json(path, remedy), remedy)
 
@@ -514,9 +508,8 @@ def _check_target(folder: Path, *, overwrite: bool) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise DataError(
-            folder, "is a file, not a folder", "choose another place with --output", code="not-a-folder"
-        )
+        problem = "is a file, not a folder"
+        raise DataError(folder, problem, "choose another place with --output", code="not-a-folder")
     marks = ("ingest/stage.json", "ingest.new/stage.json")
     if overwrite or any((folder / mark).is_file() for mark in marks):
         return
@@ -629,9 +622,8 @@ def copy_session(folder: Path, target: Path) -> None:
             if stated == {"session": str(origin_of(folder).resolve()), "ingest": record.key}:
                 return
         if target.exists():
-            raise DataError(
-                target, "exists, and is no copy of this session", "choose another --output", code="exists"
-            )
+            problem = "exists, and is no copy of this session"
+            raise DataError(target, problem, "choose another --output", code="exists")
         make_folder(target.absolute().parent)
         new = target.with_name(f".{target.name}.copying")
         remove_tree(new)

@@ -53,12 +53,8 @@ _CODES = {
 def as_data_error(error: OSError, path: Path) -> DataError:
     """Make a one-line error of an operating system's error; `path` is used if the error names no file."""
     remedy = _REMEDIES.get(error.errno or 0, "mend that and run the command again")
-    return DataError(error.filename or path, error.strerror or str(error), remedy, code=code_of(error))
-
-
-def code_of(error: OSError) -> str:
-    """Return the code of a DataError for an operating system's error."""
-    return _CODES.get(error.errno or 0, "unreadable")
+    code = _CODES.get(error.errno or 0, "unreadable")
+    return DataError(error.filename or path, error.strerror or str(error), remedy, code=code)
 
 
 def refuse_camera_names(names: Collection[str]) -> None:
@@ -433,7 +429,7 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
     target = target.absolute()
     _check(target, mark, overwrite)
     try:
-        with working_folder(_work_of(target), target) as work:
+        with working_folder(target.parent / f".{target.name}.making", target) as work:
             _put_back(work, target)
             for stale in [path for path in work.iterdir() if path.is_dir() and path.name != key]:
                 remove_tree(stale)
@@ -479,17 +475,12 @@ def is_made(target: Path, key: str, *, mark: str) -> bool:
         return False
 
 
-def _work_of(target: Path) -> Path:
-    return target.parent / f".{target.name}.making"
-
-
 def _check(target: Path, mark: str, overwrite: bool) -> None:
     if overwrite or not target.exists() or (target / mark).is_file():
         return
     if not target.is_dir():
-        raise DataError(
-            target, "is a file, not a folder", "choose another place with --output", code="not-a-folder"
-        )
+        problem = "is a file, not a folder"
+        raise DataError(target, problem, "choose another place with --output", code="not-a-folder")
     if entries := sorted(path.name for path in target.iterdir()):
         problem = f"holds something else ({len(entries)} entries, the first {entries[0]})"
         remedy = "choose another place with --output, or replace it with --overwrite"

@@ -391,11 +391,7 @@ def motion_table(motion: JointMotion) -> pd.DataFrame:
 
     t, person, joint = np.nonzero(~np.isnan(motion.position[..., 0]))
     table = pd.DataFrame(
-        {
-            "t_ns": motion.t_ns[t],
-            "person": person,
-            "joint": np.array(motion.joints, dtype=object)[joint],
-        }
+        {"t_ns": motion.t_ns[t], "person": person, "joint": np.array(motion.joints, dtype=object)[joint]}
     )
     table[_POSITION] = motion.position[t, person, joint]
     return table

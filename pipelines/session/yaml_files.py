@@ -18,15 +18,7 @@ MAX_FILE_BYTES = 1_000_000
 M = TypeVar("M", bound=YamlModel)
 
 
-def read_yaml_model(
-    path: Path,
-    model: type[M],
-    noun: str,
-    *,
-    newest: int,
-    shape: str,
-    made: str = "",
-) -> M:
+def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape: str, made: str = "") -> M:
     """Read and validate a file; one DataError holds every problem that was found.
 
     `newest` is the newest value of the key `schema`. `noun` ("flight manifest"), `shape` (the file's form)
@@ -78,9 +70,8 @@ def plain_yaml(path: Path, text: str) -> object:
 
     marks = sum(map(text.count, "\n,:[{-?&*"))
     if marks > MAX_MARKS:
-        raise DataError(
-            path, f"holds about {marks} values", f"at most {MAX_MARKS} are read", code="too-large"
-        )
+        problem = f"holds about {marks} values"
+        raise DataError(path, problem, f"at most {MAX_MARKS} are read", code="too-large")
     remedy = "mend it, or copy the file again if it was cut off"
     parser = YAML(typ="safe", pure=True)
     parser.Constructor = Constructor

@@ -201,9 +201,8 @@ class FlightCameras:
             path = self._files.path(source.file)
             calibrated = self._files.camera(name, "intrinsics", source)
             if calibrated.intrinsics is None:
-                raise DataError(
-                    path, "holds poses but no intrinsics", "name one with both", code="no-intrinsics"
-                )
+                problem = "holds poses but no intrinsics"
+                raise DataError(path, problem, "name one with both", code="no-intrinsics")
             intrinsics = calibrated.intrinsics
             if calibrated.note:
                 self._note(f"{name}: {calibrated.note}")

@@ -179,9 +179,8 @@ class FlightFiles:
         motion = _without_far_joints(motion)
         if not np.isfinite(motion.position).any():
             lost = f" ({losses(motion.dropped)})" if motion.dropped else ""
-            raise DataError(
-                path, f"holds no position of a joint{lost}", "check what wrote it", code="no-positions"
-            )
+            problem = f"holds no position of a joint{lost}"
+            raise DataError(path, problem, "check what wrote it", code="no-positions")
         return replace(motion, t_ns=motion.t_ns + source.offset_ns)
 
     @staticmethod

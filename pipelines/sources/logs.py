@@ -241,12 +241,7 @@ class FlightLogs:
             return replace(found, t_ns=opened.world_times(found.t_ns), dropped=dropped)
 
     def attitudes(
-        self,
-        log: str,
-        topic: str,
-        *,
-        order: Literal["ypr", "rpy", "pry"],
-        units: Literal["deg", "rad"],
+        self, log: str, topic: str, *, order: Literal["ypr", "rpy", "pry"], units: Literal["deg", "rad"]
     ) -> Trajectory:
         """Read a gimbal's attitude in the log's axes, at world times; its positions have no meaning."""
         with self.open(log) as opened:
@@ -267,9 +262,8 @@ class FlightLogs:
             name, source = opened.choose("intrinsics", topic), opened.source
             for sample in all_samples(opened.recording.messages([name]), source):
                 if not isinstance(sample, IntrinsicsSample):
-                    raise DataError(
-                        source, f"{name} holds no camera info", "name another topic", code="no-intrinsics"
-                    )
+                    problem = f"{name} holds no camera info"
+                    raise DataError(source, problem, "name another topic", code="no-intrinsics")
                 count += 1
                 if sample.intrinsics is not None:
                     found.setdefault(sample.intrinsics, sample.note)
@@ -296,9 +290,8 @@ class FlightLogs:
             taken_ns, received_ns = picture_stamps(opened.recording, name, opened.source)
             t_ns = later_times(taken_ns, received_ns, opened.settings.stamps)
             if not len(t_ns):
-                raise DataError(
-                    opened.source, f"{name} holds no picture", "name another topic", code="no-pictures"
-                )
+                problem = f"{name} holds no picture"
+                raise DataError(opened.source, problem, "name another topic", code="no-pictures")
             lost = opened.lost + Counter({"picture without a later stamp": len(taken_ns) - len(t_ns)})
             if opened.settings.stamps == "header" and (steps := find_steps(taken_ns, received_ns)):
                 opened.note_steps(name, steps)
@@ -330,12 +323,7 @@ DEFAULT_HEIGHT_M = 2.5
 
 
 def maps_of_log(
-    flight: Manifest,
-    stated: MapSource,
-    logs: FlightLogs,
-    *,
-    max_gap_ns: int,
-    note: Callable[[str], None],
+    flight: Manifest, stated: MapSource, logs: FlightLogs, *, max_gap_ns: int, note: Callable[[str], None]
 ) -> LoggedMaps:
     """Read the maps of a topic, in ENU axes at world times.
 

@@ -281,9 +281,8 @@ class FlightPoses:
             return mounted(mount)
         except ValueError as error:
             place = f"{self._manifest}: cameras.{name}.mount"
-            raise DataError(
-                place, str(error), "say how the camera sits on the body", code="bad-value"
-            ) from None
+            problem = str(error)
+            raise DataError(place, problem, "say how the camera sits on the body", code="bad-value") from None
 
     def _on_body(
         self, name: str, camera: CameraSources, body: Trajectory, angles: AttitudeTrack | None
@@ -567,9 +566,8 @@ class FlightPoses:
     def _one_file(self, stated: str) -> Path:
         paths = self._logs.paths(stated)
         if len(paths) != 1:
-            raise DataError(
-                self._manifest, f"logs.{stated}: a drone's own log is one file", "name one", code="ambiguous"
-            )
+            problem = f"logs.{stated}: a drone's own log is one file"
+            raise DataError(self._manifest, problem, "name one", code="ambiguous")
         return paths[0]
 
     def _world_times(self, stated: str, t_ns: Int64, since_ns: int) -> Int64:

@@ -268,9 +268,8 @@ class Projection:
         found[~np.isfinite(found).all(axis=1)] = np.nan  # pyproj says inf outside the CRS
         if len(found) and np.isnan(found[:, 0]).all():
             x, y = position[0, :2].tolist()
-            raise DataError(
-                source, f"its x {x:.0f}, y {y:.0f} lies outside {self.name}", _NO_PLACE, code="place-unknown"
-            )
+            problem = f"its x {x:.0f}, y {y:.0f} lies outside {self.name}"
+            raise DataError(source, problem, _NO_PLACE, code="place-unknown")
         return found
 
     def _turn(self, source: Path | str, position: Float, origin: Place) -> Float:

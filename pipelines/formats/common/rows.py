@@ -82,9 +82,8 @@ def parse_table(
             bad = _first_bad_line(lines, delimiter, columns, numbers)
             if truncated or bad is None or bad[0] < len(lines) - 1:
                 where, what = bad or (0, str(error).splitlines()[0])
-                raise DataError(
-                    path, f"line {first_line + where}: {what}", "correct or delete that line"
-                ) from error
+                problem = f"line {first_line + where}: {what}"
+                raise DataError(path, problem, "correct or delete that line") from error
             body = "\n".join(lines[:-1])
         else:
             return TextTable(

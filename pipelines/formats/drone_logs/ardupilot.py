@@ -172,9 +172,8 @@ class ArduPilotFormat(DroneLog):
             if rows is not None:
                 t_ns = rows.t_ns()
                 return pictures_on_gps_time(path, t_ns[t_ns > 0], _gps_time(log), choice)
-        raise DataError(
-            path, "holds no CAM or TRIG message", "take the times of frames otherwise", code="wrong-kind"
-        )
+        problem = "holds no CAM or TRIG message"
+        raise DataError(path, problem, "take the times of frames otherwise", code="wrong-kind")
 
 
 def _position(
@@ -329,9 +328,8 @@ def _index(path: Path) -> Any:
     try:
         with path.open("rb") as file:
             if file.read(len(_START)) != _START:
-                raise DataError(
-                    path, "is no ArduPilot log", "give the .bin that the autopilot wrote", code="wrong-kind"
-                )
+                problem = "is no ArduPilot log"
+                raise DataError(path, problem, "give the .bin that the autopilot wrote", code="wrong-kind")
         refuse_marks(path, _START[:2])
         refuse_marks(path, _START, most=_MOST_DEFINITIONS)
     except OSError as error:

@@ -35,7 +35,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, AttitudeTrack, Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import code_of, empty, plain_text
+from pipelines.session.storage import as_data_error, empty, plain_text
 
 # DJI's drones fly no higher than this above their take-off.
 _HIGHEST_M = 500
@@ -126,9 +126,8 @@ def choose_height(
         remedy = "state it, in metres above the take-off: pose: {file: ..., altitude: 30}"
         raise DataError(path, "holds no height", remedy, code="no-positions")
     if stated is not None and stated not in there:
-        raise DataError(
-            path, f"holds no {stated} height", f"write altitude: {next(iter(there))}, or the metres"
-        )
+        problem = f"holds no {stated} height"
+        raise DataError(path, problem, f"write altitude: {next(iter(there))}, or the metres")
     if stated is None and not named:
         highest_m = float(np.nanmax(unnamed))
         if highest_m > _HIGHEST_M:
@@ -247,9 +246,7 @@ def read_subtitles(path: Path) -> Subtitles:
     try:
         text = plain_text(path.read_bytes())
     except OSError as error:
-        raise DataError(
-            path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error)
-        ) from error
+        raise as_data_error(error, path) from error
     subtitles = parse_subtitles(text)
     if not subtitles.texts:
         raise empty(path, "holds no subtitles" if text.strip() else "is empty")

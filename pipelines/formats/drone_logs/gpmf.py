@@ -186,9 +186,8 @@ def _read(path: Path) -> _Track:
                     if inner == "STRM":
                         _take_stream(track, start_ns, length_ns, stream)
     if not track.rows:
-        raise DataError(
-            path, "has no track of GoPro's telemetry", "name another log of poses", code="wrong-kind"
-        )
+        problem = "has no track of GoPro's telemetry"
+        raise DataError(path, problem, "name another log of poses", code="wrong-kind")
     return track
 
 

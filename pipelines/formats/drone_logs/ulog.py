@@ -92,9 +92,8 @@ class UlogFormat(DroneLog):
         for name in ("camera_capture", "camera_trigger"):
             if found := [topic for topic in topics if topic.name == name and len(topic)]:
                 return pictures_on_gps_time(path, found[0].t_ns(), _gps_time(topics), choice)
-        raise DataError(
-            path, "holds no camera_capture or camera_trigger", "take the times of frames otherwise"
-        )
+        problem = "holds no camera_capture or camera_trigger"
+        raise DataError(path, problem, "take the times of frames otherwise")
 
 
 def telemetry_of(

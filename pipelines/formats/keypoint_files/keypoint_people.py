@@ -240,9 +240,8 @@ class Gathering:
         """
         frame = frame_number(name, self.digits)
         if frame is None:
-            raise DataError(
-                where, f"picture {name!r} has no frame number", "name pictures with the number at the end"
-            )
+            problem = f"picture {name!r} has no frame number"
+            raise DataError(where, problem, "name pictures with the number at the end")
         picture = name if isinstance(name, str) else str(frame)
         label = f"{file.name}, {picture}" if file else picture
         other = self._listed.setdefault(frame, label)
@@ -289,9 +288,8 @@ class Gathering:
             fit = max(SKELETONS.values(), key=lambda s: (len(joints & {*s.joints}), -len(s.joints)))
             if len(joints & {*fit.joints}) < LEAST_NAMED_JOINTS:
                 problem = f"names its keypoints {', '.join(names[:6])}: they are no joints of people"
-                raise DataError(
-                    self.path, problem, "name them as left_shoulder, right_knee", code="unsupported"
-                )
+                remedy = "name them as left_shoulder, right_knee"
+                raise DataError(self.path, problem, remedy, code="unsupported")
             self.joint_names = fit.joints
         place = {joint: k for k, joint in enumerate(self.joint_names)}
         rows = np.zeros((len(place), 3))
@@ -313,9 +311,8 @@ class Gathering:
             causes = [f"{number} x {cause}" for cause, number in sorted(self.dropped.items()) if number]
             causes += [f"{len(self._listed)} x frame without people"] if self._listed else []
             detail = f" ({', '.join(causes)})" if causes else ""
-            raise DataError(
-                self.path, f"holds no keypoints{detail}", "check that the detector saw the person"
-            )
+            problem = f"holds no keypoints{detail}"
+            raise DataError(self.path, problem, "check that the detector saw the person")
         return len(self._rows[0])
 
     def leave_out_face_and_hands(self) -> None:

@@ -27,9 +27,7 @@ _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.AS
 OCTOMAP = "octomap_msgs/msg/Octomap"
 # rosbags does not know these types, and logs of ROS 2 up to Humble carry no definitions.
 _DEFINITIONS = {
-    OCTOMAP: {
-        OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n",
-    },
+    OCTOMAP: {OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"}
 }
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 

@@ -191,12 +191,11 @@ def _lens(message: Message, source: Source, matrix: Float, distortion: list[floa
     model = value.distortion_model.lower()
     known = _FISHEYE_MODELS | _RADTAN_MODELS
     if model not in known and (model not in _NO_MODELS or any(distortion)):
-        raise DataError(
-            source,
+        problem = (
             f"topic {topic}: its distortion model {value.distortion_model!r} is none of"
-            f" {', '.join(sorted(known))}",
-            "give a calibration file under `intrinsics`",
+            f" {', '.join(sorted(known))}"
         )
+        raise DataError(source, problem, "give a calibration file under `intrinsics`")
     full = intrinsics(
         source,
         topic,

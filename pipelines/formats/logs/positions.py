@@ -114,12 +114,7 @@ def read_positions(
     return replace(track, accuracy_m=(float(sigma[0]), float(sigma[1])))
 
 
-def _read(
-    recording: Log,
-    source: str,
-    topic: str,
-    numbers: Callable[[Any], Sequence[float]],
-) -> LoggedRows:
+def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> LoggedRows:
     header_ns, receive_ns, values = array("q"), array("q"), array("d")
     for message in recording.messages([topic]):
         value = message.value

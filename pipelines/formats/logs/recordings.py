@@ -232,9 +232,8 @@ class ChunkedPart(LogPart):
         """Count a record that was found in a chunk."""
         self._records_left -= 1
         if self._records_left < 0:
-            raise DataError(
-                self.path, "inflates to more messages than it has bytes", RECORD_AGAIN, code="too-large"
-            )
+            problem = "inflates to more messages than it has bytes"
+            raise DataError(self.path, problem, RECORD_AGAIN, code="too-large")
 
     def close(self) -> None:
         """Close the file."""
@@ -417,11 +416,7 @@ class OpenLog:
 
     def _described(self, topic: Topic) -> dict[str, object]:
         schemas, stamps = self._messages_of(topic.name, topic.type, topic.encoding)
-        facts: dict[str, object] = {
-            "type": topic.type,
-            "encoding": topic.encoding,
-            "messages": topic.count,
-        }
+        facts: dict[str, object] = {"type": topic.type, "encoding": topic.encoding, "messages": topic.count}
         if topic.first_ns is not None and topic.last_ns is not None:
             span_ns = topic.last_ns - topic.first_ns
             facts |= {"first_ns": topic.first_ns, "last_ns": topic.last_ns}

@@ -168,9 +168,8 @@ def _open_compressed(path: Path) -> LogPart:
                     while part_of := content.read(_COPIED):
                         target.write(part_of)
                         if target.tell() > most:
-                            raise DataError(
-                                path, f"inflates to more than {most} bytes", RECORD_AGAIN, code="too-large"
-                            )
+                            problem = f"inflates to more than {most} bytes"
+                            raise DataError(path, problem, RECORD_AGAIN, code="too-large")
             except (ZstdError, EOFError):
                 whole = False
         # The folder is deleted while the part is open, which keeps its file by the handle.

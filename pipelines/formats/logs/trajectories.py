@@ -144,9 +144,8 @@ def attitudes_of(
     gathered, of_angles = _Samples(), False
     for sample in samples:
         if not isinstance(sample, AngleSample):
-            raise DataError(
-                source, "holds no gimbal angles", "name a topic of angles or quaternions", code="no-attitude"
-            )
+            problem = "holds no gimbal angles"
+            raise DataError(source, problem, "name a topic of angles or quaternions", code="no-attitude")
         of_angles = sample.angles is not None
         gathered.add(sample, sample.angles or sample.quaternion_xyzw or ())
     rows = gathered.rows(3 if of_angles else 4)
@@ -185,13 +184,7 @@ def transforms_of(
 
 
 def chained(
-    transforms: TransformLog,
-    source: Source,
-    *,
-    parent: str,
-    child: str,
-    stamps: Stamps,
-    max_gap_ns: int,
+    transforms: TransformLog, source: Source, *, parent: str, child: str, stamps: Stamps, max_gap_ns: int
 ) -> Gathered:
     """Compute the pose of one frame in another over time, through the log's tree of transforms.
 

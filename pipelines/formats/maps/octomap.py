@@ -178,9 +178,8 @@ def _split(path: Path, content: bytes) -> tuple[_OctomapHeader, Bytes]:
             _LEGACY.size :
         ]
     if not content.startswith((_BINARY, _FULL)):
-        raise DataError(
-            path, "is no OctoMap file", f"its first line must be {_BINARY.decode()!r}", code="wrong-kind"
-        )
+        problem = "is no OctoMap file"
+        raise DataError(path, problem, f"its first line must be {_BINARY.decode()!r}", code="wrong-kind")
     lines, payload = split_header(path, content, "data")
     values = {words[0]: words[1] for words in lines if len(words) == 2}
     try:

@@ -212,11 +212,7 @@ def _ply_header(path: Path, lines: list[list[str]]) -> tuple[str, list[tuple[str
 
 
 PLY = CloudFile(
-    "ply",
-    "point cloud (PLY)",
-    (".ply",),
-    lambda head: head[:16].split(b"\n")[0].strip() == b"ply",
-    read_ply,
+    "ply", "point cloud (PLY)", (".ply",), lambda head: head[:16].split(b"\n")[0].strip() == b"ply", read_ply
 )
 
 

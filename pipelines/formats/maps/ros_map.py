@@ -97,9 +97,8 @@ def _read_plan(path: Path) -> _FloorPlan:
         if key not in values
     ]
     if missing:
-        raise DataError(
-            path, f"lacks {', '.join(missing)}", "map_server's files have them all", code="missing-column"
-        )
+        problem = f"lacks {', '.join(missing)}"
+        raise DataError(path, problem, "map_server's files have them all", code="missing-column")
     origin = numbers(path, "origin", values["origin"])
     resolution, occupied, free = numbers(
         path,
@@ -156,9 +155,8 @@ def _probabilities(path: Path, plan: _FloorPlan) -> Float32:
         if plan.mode == "scale":
             probability = np.where(opaque, probability, np.nan)
     if np.isnan(probability).all():
-        raise DataError(
-            path, "is an empty map: every pixel is unknown", "check mode and thresholds", code="empty"
-        )
+        problem = "is an empty map: every pixel is unknown"
+        raise DataError(path, problem, "check mode and thresholds", code="empty")
     return np.ascontiguousarray(probability[::-1].T, dtype=np.float32)
 
 
@@ -176,9 +174,8 @@ def _picture(image: Path) -> tuple[Float, Bool]:
             colours = np.asarray(picture.convert("RGBA"), dtype=np.float64) / 255
             return colours[..., :3].mean(axis=2), colours[..., 3] == 1
     except UnidentifiedImageError as error:
-        raise DataError(
-            image, "is no PGM or PNG picture", "convert it to one of them", code="wrong-kind"
-        ) from error
+        problem = "is no PGM or PNG picture"
+        raise DataError(image, problem, "convert it to one of them", code="wrong-kind") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise damaged(image, f"cannot be read as a picture ({str(error)[:100]})") from error
 

@@ -145,13 +145,7 @@ def placed(
 
 
 def extruded(
-    source: str,
-    plan: Float32,
-    resolution_m: float,
-    world_from_plan: Pose,
-    *,
-    side_m: float,
-    height_m: float,
+    source: str, plan: Float32, resolution_m: float, world_from_plan: Pose, *, side_m: float, height_m: float
 ) -> Occupancy:
     """Convert a floor plan [X, Y] of probabilities, with the pose of its origin, to voxels extruded upwards.
 

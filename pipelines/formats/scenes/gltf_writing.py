@@ -260,9 +260,8 @@ class GltfAsset:
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + len(self.buffer)
         if total > _LARGEST:
-            raise DataError(
-                name, "has more moments than a GLB can hold (4 GB)", "export bvh or parquet", code="too-large"
-            )
+            problem = "has more moments than a GLB can hold (4 GB)"
+            raise DataError(name, problem, "export bvh or parquet", code="too-large")
         head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
         return head + text + struct.pack("<I4s", len(self.buffer), b"BIN\0") + bytes(self.buffer)
 

@@ -164,9 +164,8 @@ class McapExport:
         note_no_skeleton(recording, self.name)
         start_ns, end_ns = min(int(t[0]) for t in times), max(int(t[-1]) for t in times)
         if start_ns < 0 or end_ns >= _LATEST_NS:
-            raise DataError(
-                recording.name, "has times outside of 1970 to 2038, which ROS cannot count", "export csv"
-            )
+            problem = "has times outside of 1970 to 2038, which ROS cannot count"
+            raise DataError(recording.name, problem, "export csv")
         topics = topics_of(list(tracks))
         streams = [_map(recording, start_ns), _doubts(recording, start_ns)]
         for name, track in tracks.items():
@@ -334,10 +333,7 @@ def _path(topic: str, track: Trajectory, start_ns: int) -> Iterator[Entry]:
     poses = [
         {
             "header": {"stamp": int(track.t_ns[row]), "frame_id": "world"},
-            "pose": {
-                "position": _xyz(track.position[row]),
-                "orientation": _xyzw(track.quaternion_xyzw[row]),
-            },
+            "pose": {"position": _xyz(track.position[row]), "orientation": _xyzw(track.quaternion_xyzw[row])},
         }
         for row in thinned(track.t_ns, _PATH_HZ).tolist()
     ]

@@ -141,9 +141,8 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
         problem = f"the unit {unit!r} is none of {', '.join(METRES)}"
         raise DataError(path, problem, "state one of them", code="unit-unknown")
     if axes not in AXES:
-        raise DataError(
-            path, f"the axes {axes!r} are none of {', '.join(AXES)}", "state one of them", code="axes-unknown"
-        )
+        problem = f"the axes {axes!r} are none of {', '.join(AXES)}"
+        raise DataError(path, problem, "state one of them", code="axes-unknown")
     contents = _read(path)
     metres, order = METRES[unit], _IN_WORLD[axes]
     turned = [*order, 3]  # a rotation's axis is turned like any other vector

@@ -200,9 +200,8 @@ def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
     first = _number(contents, "POINT", "DATA_START")
     scale = _number(contents, "POINT", "SCALE") or 0.0
     if np.size(contents["data"]["analogs"]) or scale >= 0 or first is None:
-        raise DataError(
-            path, f"holds {frames} frames beside analog channels or in integers", "export it in parts"
-        )
+        problem = f"holds {frames} frames beside analog channels or in integers"
+        raise DataError(path, problem, "export it in parts")
     start = (int(first) - 1) * _BLOCK + read * points * 16
     values = np.fromfile(path, "<f4", count=(frames - read) * points * 4, offset=start)
     if len(values) < (frames - read) * points * 4:
@@ -293,13 +292,7 @@ class C3dExport:
 
 
 def write_joints(
-    path: Path,
-    even: EvenMotion,
-    person: int,
-    *,
-    unit: str,
-    axes: str,
-    events: pd.DataFrame | None = None,
+    path: Path, even: EvenMotion, person: int, *, unit: str, axes: str, events: pd.DataFrame | None = None
 ) -> None:
     """Write one person's joints, and rows of `tables.GAIT` as events; the module explains the residuals."""
     ezc3d = need("ezc3d", "c3d")
@@ -321,7 +314,7 @@ def write_joints(
     stated["RATE"]["value"] = [even.rate_hz]
     stated["SCALE"]["value"] = [-step]
     stated["UNITS"]["value"] = [unit]
-    stated["LABELS"]["value"] = _short(names)
+    stated["LABELS"]["value"] = _unique([_cut(name, _LONGEST_LABEL) for name in names], _LONGEST_LABEL)
     stated["DESCRIPTIONS"]["value"] = [_cut(name, _LONGEST_TEXT) for name in names]
     file.add_parameter("POINT", "X_SCREEN", ["+X"])
     file.add_parameter("POINT", "Y_SCREEN", ["+Y" if axes == "y-up" else "+Z"])
@@ -354,11 +347,6 @@ def _residuals(motion: JointMotion, person: int, missing: Any, step: float) -> F
         steps = np.minimum(np.rint(sigma_mm), _MOST_RESIDUAL)
     # ezc3d truncates the decimals: a quarter more keeps 7 from becoming 6.9999.
     return np.where(missing, -1.0, (steps + 0.25) * step)
-
-
-def _short(names: Sequence[str]) -> list[str]:
-    """Return labels of at most 30 bytes, as programs show them; equal ones get a number."""
-    return _unique([_cut(name, _LONGEST_LABEL) for name in names], _LONGEST_LABEL)
 
 
 def _unique(names: Sequence[str], longest: int = _LONGEST_TEXT) -> list[str]:

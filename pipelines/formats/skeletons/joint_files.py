@@ -343,9 +343,8 @@ def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
     try:
         numbers = pc.cast(pc.utf8_trim_whitespace(column), pa.int64())
     except pa.ArrowInvalid as error:
-        raise DataError(
-            path, "holds a person that is no whole number", "number the people 0, 1, ..."
-        ) from error
+        problem = "holds a person that is no whole number"
+        raise DataError(path, problem, "number the people 0, 1, ...") from error
     if numbers.null_count:
         raise DataError(path, f"{numbers.null_count} rows name no person", "number the people 0, 1, ...")
     return np.asarray(numbers.to_numpy(), dtype=np.int64)

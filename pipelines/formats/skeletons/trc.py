@@ -71,9 +71,8 @@ def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
         raise damaged(path, f"names {len(markers)} markers above {columns} columns of coordinates")
     twice = sorted(marker for marker, count in Counter(markers).items() if count > 1)
     if twice:
-        raise DataError(
-            path, f"names the marker {twice[0]} more than once", "rename one", code="stated-twice"
-        )
+        problem = f"names the marker {twice[0]} more than once"
+        raise DataError(path, problem, "rename one", code="stated-twice")
     keys = zip(lines[1].split("\t"), lines[2].split("\t"), strict=False)
     return _TrcHeader({key.strip(): value.strip() for key, value in keys}, markers), lines[5:], 6
 

@@ -176,9 +176,8 @@ def _clean(
     kept = order[keep]
     if not len(kept):
         counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
-        raise DataError(
-            path, f"holds no usable frame time ({counts})", "check how it was written", code="clock-unknown"
-        )
+        problem = f"holds no usable frame time ({counts})"
+        raise DataError(path, problem, "check how it was written", code="clock-unknown")
     return FrameStamps(frame[kept], t_ns[kept], None if media_ns is None else media_ns[kept], dropped)
 
 

@@ -78,7 +78,7 @@ def read_tags(path: Path) -> Tags:
 
     try:
         with path.open("rb") as file:
-            xmp = _xmp(file.read(_HEAD))
+            xmp = {name.decode(): text.decode("latin-1") for name, text in _TAG.findall(file.read(_HEAD))}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of damaged tags; the others are taken
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # no picture is decoded here
@@ -113,11 +113,6 @@ def picture_times(tags: Sequence[Tags]) -> tuple[Int64, bool]:
     before += np.where(second == 0, room[0] - counts[0], 0)  # the first second is full at its end
     spread: Int64 = t_ns + (before * _SECOND_NS // room[second]).astype(np.int64)
     return spread, True
-
-
-def _xmp(head: bytes) -> dict[str, str]:
-    """Return the text of each tag by its name without the maker."""
-    return {name.decode(): text.decode("latin-1") for name, text in _TAG.findall(head)}
 
 
 def _number(text: object) -> float | None:
@@ -222,9 +217,8 @@ class FolderPictures:
     def __init__(self, path: Path) -> None:
         self.files = picture_files(path)
         if not self.files:
-            raise DataError(
-                path, "is no folder of pictures", "name the folder that holds them", code="wrong-kind"
-            )
+            problem = "is no folder of pictures"
+            raise DataError(path, problem, "name the folder that holds them", code="wrong-kind")
         self._size: tuple[int, ...] | None = None
 
     def __enter__(self) -> Self:
@@ -318,9 +312,8 @@ def _columns(path: Path) -> tuple[Int64, bool, dict[str, Float]]:
     """Return times and columns of all pictures, and True if some share a second (`picture_times`)."""
     files = picture_files(path)
     if not files:
-        raise DataError(
-            path, "is no folder of pictures", "name the folder that holds them", code="wrong-kind"
-        )
+        problem = "is no folder of pictures"
+        raise DataError(path, problem, "name the folder that holds them", code="wrong-kind")
     tags = [read_tags(file) for file in files]
     t_ns, shared = picture_times(tags)
     columns = {name: np.array([each.values.get(name, np.nan) for each in tags]) for name in NAMES}

@@ -23,7 +23,7 @@ from pipelines.formats.common.rows import describe_times
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import UNTIMED, VideoIndex
-from pipelines.session.storage import code_of, damaged, empty
+from pipelines.session.storage import as_data_error, damaged, empty
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
@@ -245,9 +245,8 @@ class VideoReader:
         count = self.index.count
         last = count if stop is None else stop
         if not 0 <= start <= last <= count or step < 1:
-            raise DataError(
-                self._path, f"has no frames {start} to {last - 1} by {step}", f"it has 0 to {count - 1}"
-            )
+            problem = f"has no frames {start} to {last - 1} by {step}"
+            raise DataError(self._path, problem, f"it has 0 to {count - 1}")
         reader = object()
         for number in range(start, last, step):
             if self._reader is not reader:
@@ -375,10 +374,7 @@ def _scan(path: Path) -> _Scan:
     hidden = tick_s >= 1 and 2 * len(ticks) < listed
     if hidden or shown_s < _SHORTEST_S * (len(ticks) - 1):
         raise damaged(path, f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s")
-    counts = {
-        "cut off": len(lost) + len(stamped) - len(sure),
-        "no stamp": len(whole) - len(stamped),
-    }
+    counts = {"cut off": len(lost) + len(stamped) - len(sure), "no stamp": len(whole) - len(stamped)}
     once = np.ones(len(ticks), np.bool_)
     once[1:] &= np.diff(ticks) > 0
     once[:-1] &= np.diff(ticks) > 0
@@ -526,9 +522,7 @@ def _kind(path: Path) -> str:
         size = path.stat().st_size
         kind = container_format(path)
     except OSError as error:
-        raise DataError(
-            path, f"cannot be read ({error.strerror})", "check the path", code=code_of(error)
-        ) from error
+        raise as_data_error(error, path) from error
     if not size:
         raise empty(path, "is empty")
     if kind is None:

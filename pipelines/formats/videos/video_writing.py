@@ -183,9 +183,8 @@ def _angle_named(words: str) -> str:
     endings = ("", "_flexion", "_dorsiflexion", "_elevation", "_pronation")
     name = next((words + end for end in endings if words + end in ANGLES), None)
     if name is None:
-        raise DataError(
-            "overlay", f"there is no angle {words!r}", f"there are {', '.join(ANGLES)}", code="no-such-name"
-        )
+        problem = f"there is no angle {words!r}"
+        raise DataError("overlay", problem, f"there are {', '.join(ANGLES)}", code="no-such-name")
     return name
 
 
