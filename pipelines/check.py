@@ -116,7 +116,8 @@ def _checked(
     description = read_description(folder)
     detected, pictures = _detected(session, description, detector, workers, progress)
     doubts = _doubts(session, description, detected, pose_noise)
-    return Checked(doubts, list(description.warnings), pictures)
+    alone = ["one camera: its poses were not compared with another view"] * (len(description.cameras) == 1)
+    return Checked(doubts, [*description.warnings, *alone], pictures)
 
 
 def _doubts(

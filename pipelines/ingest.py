@@ -188,6 +188,7 @@ def ingest(
                 cameras=entries,
                 actor=actors[0] if actors else None,
                 actors=actors if flight.actors else [],
+                stature_m=flight.stature_m,
                 map=map_,
                 truth=truth,
                 plan=plan,

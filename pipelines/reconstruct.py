@@ -19,7 +19,15 @@ from pipelines.detect import cameras_to_follow, detect, follow, hints_from, hint
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views
-from pipelines.keypoints.association import Association, Ground, Surroundings, associate, level_of
+from pipelines.keypoints.association import (
+    Association,
+    Ground,
+    Surroundings,
+    associate,
+    associate_one_camera,
+    level_of,
+)
+from pipelines.keypoints.bodies import SightLines
 from pipelines.keypoints.corrections import (
     measured_for,
     read_calibration,
@@ -28,7 +36,14 @@ from pipelines.keypoints.corrections import (
 )
 from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
-from pipelines.reconstruction.bodies import body_figures, body_parts, fit_bodies, load_true_bodies, shape_rows
+from pipelines.reconstruction.bodies import (
+    bodies_of_one_camera,
+    body_figures,
+    body_parts,
+    fit_bodies,
+    load_true_bodies,
+    shape_rows,
+)
 from pipelines.reconstruction.body_fit import BodyFit
 from pipelines.reconstruction.clocks import (
     MIN_SIGMAS_TO_MOVE,
@@ -233,7 +248,9 @@ def reconstruct(
         doubts = _doubts(flight, stored)
         _refuse_nothing(folder, stored, doubts)
         gait, walks = gait_of(stored.observations, stored.result)
-        bodies = fit_bodies(stored.observations, stored.views, stored.result)
+        bodies = stored.bodies
+        if bodies is None:
+            bodies = fit_bodies(stored.observations, stored.views, stored.result)
         metrics = stored.metrics | {
             "gait": walks,
             "body": body_figures(
@@ -524,6 +541,7 @@ def _without_swaps(cameras: list[Camera], waiting: Waiting) -> tuple[list[Camera
 class Attempt:
     """Result of one reconstruction of the flight (one trial)."""
 
+    bodies: list[BodyFit | None] | None  # of a single camera, which has no result without them
     clocks: FoundClocks | None  # those that were found, of all cameras; None where all are held
     observations: Observations
     views: Views
@@ -560,12 +578,12 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     seen, views, solve = made.seen, made.views, made.solve
     observations = seen.observations
     progress.advance()
-    doubted = _doubted(made)
+    doubted = _doubted(made) if made.bodies is None else [""] * len(made.bodies)
     result = refused_people(made.result, observations, seen.anybody)
     progress.advance()
     refined = None
     calibrated = settings.method == "auto" and are_calibrated(cameras, observations)
-    if settings.method in ("refined", "auto") and not calibrated:
+    if settings.method in ("refined", "auto") and not calibrated and len(cameras) > 1:
         robust = _robust_flight(flight, cameras, replace(made, result=result), clock_sigma_s)
         refined = flight.waiting.put(refine_flight(robust))
         flight.waiting.release()
@@ -597,6 +615,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     known = source_of_pose_noise(description, logged, settings.pose_noise)
     progress.advance()
     return Attempt(
+        made.bodies,
         clocks,
         observations,
         views,
@@ -609,7 +628,8 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         | {"people": people}
         | ({"readout": readout} if readout else {})
         | parts
-        | {"method_used": method_used(parts, cameras, known, settings.method)},
+        | {"method_used": method_used(parts, cameras, known, settings.method)}
+        | ({} if made.bodies is None else {"with_second_drone_mm": made.with_second_drone_mm}),
         _poses_stored(cameras, refined, background["background"], flight.between),
         [
             *warnings,
@@ -658,6 +678,8 @@ def clocks_of(
             clocks = FoundClocks(offset_s, sigma_s, none, wrong=by)
             cameras, prior_s = shifted(cameras, clocks.offset_s), np.where(known, 0.0, prior_s)
     prior_s = with_reference(description, cameras, prior_s)
+    if len(cameras) == 1:  # rays of one camera meet nothing that could show its clock
+        return clocks, prior_s, None
     made = None
     if (exact & ~known).any():
         made = _triangulated(flight, cameras)
@@ -689,6 +711,8 @@ class _Triangulated:
     views: Views
     result: Triangulation
     solve: Callable[[Views], Triangulation]
+    bodies: list[BodyFit | None] | None = None  # of a single camera
+    with_second_drone_mm: float | None = None
 
 
 def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
@@ -696,6 +720,17 @@ def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
     flight.waiting.release()
     views = views_with_noise(cameras, seen.observations, pixel_sigma=PIXEL_SIGMA_PX)
     solve = solver_for(flight.settings.method, cameras, seen.observations, pixel_sigma=PIXEL_SIGMA_PX)
+    if len(cameras) == 1:
+        one = bodies_of_one_camera(
+            seen.observations,
+            views,
+            ground=flight.ground,
+            of_map=flight.description.map is not None,
+            stature_m=flight.description.stature_m,
+        )
+        return _Triangulated(
+            seen, views, flight.waiting.put(one.result), solve, one.bodies, one.with_second_drone_mm
+        )
     return _Triangulated(seen, views, flight.waiting.put(solve(views)), solve)
 
 
@@ -793,17 +828,13 @@ def find_people(
     """
     found = candidates(cameras, between)
     sigma = ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=PIXEL_SIGMA_PX)
-    association = associate(
-        (found.t_ns - found.t_ns[0]) / 1e9,
-        found.rays,
-        found.confidence,
-        found.position,
-        found.rotation,
-        sigma,
-        actors=np.stack([actor.hips_at(found.t_ns) for actor in actors], axis=1) if actors else None,
-        people=people,
-        scene=scene,
-    )
+    time_s = (found.t_ns - found.t_ns[0]) / 1e9
+    views = SightLines(found.rays, found.confidence, found.position, found.rotation, sigma)
+    logged = np.stack([actor.hips_at(found.t_ns) for actor in actors], axis=1) if actors else None
+    if len(cameras) == 1:
+        association = associate_one_camera(time_s, views, actors=logged, people=people)
+    else:
+        association = associate(time_s, *views, actors=logged, people=people, scene=scene)
     return found, association, sigma
 
 

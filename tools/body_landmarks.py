@@ -28,10 +28,9 @@ import numpy as np
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
 from benchmarks.corpus.stored import DETECTORS, flights
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.body_model import BUILDS, SEXES, body_model, height_standing
+from pipelines.geometry.body_model import BUILDS, SEXES, body_model, height_standing, neutral_turns
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.geometry.rig import BONE, SIDES, joint_centres
-from pipelines.geometry.skinning import neutral_turns
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.people import get_skeleton, with_derived
 from pipelines.session.tables import SKELETON, read_motion

@@ -152,6 +152,63 @@ def associate(
     return _counted(chosen, seen, resumed, refused, doubts, unseen, tuple(reasons))
 
 
+def associate_one_camera(
+    time_s: Float,
+    views: SightLines,
+    *,
+    actors: Float | None = None,
+    actor_sigma_m: float = 1.0,
+    people: int | None = 1,
+) -> Association:
+    """Choose the detections of people in one camera, as `associate` does: the logged first, then most seen.
+
+    A body that is seen at other times than a person continues them. Without a number of people (None) those
+    who were logged are chosen, and whoever else is seen for half as long as the first.
+    """
+    logs = None if actors is None else np.append(actors, np.full((*actors.shape[:2], 1), actor_sigma_m), -1)
+    seen = find_bodies(time_s, views, logs)
+    track, there = seen.track[:, 0], np.isfinite(views.xy).all(axis=-1) & (views.confidence > 0)
+    trust = np.where(there, views.confidence, 0.0).sum(axis=(1, 3))
+    ray = rays_of(views.xy[:, 0], np.nan_to_num(views.rotation[:, 0]))
+    middle = median_of(np.where(there[:, 0, ..., None], ray, np.nan), axis=2)
+    bodies = []
+    for identity in np.unique(track[track >= 0]).tolist():
+        time, detection = np.nonzero(track == identity)
+        away = np.full((1 if actors is None else actors.shape[1], len(time)), np.nan)
+        if actors is not None:
+            sight = np.swapaxes(actors[time], 0, 1) - views.position[time, 0]
+            away = np.linalg.norm(np.cross(middle[time, detection], sight), axis=-1) ** 2
+            away /= actor_sigma_m**2 + _LOGGED_POINT_M**2
+        near = np.nansum(_NEAR_CHI2 - np.minimum(away, _FAR_CHI2), axis=1)
+        bodies.append((identity, time, near, float(trust[time].sum())))
+    chosen, total = np.full((len(time_s), 1, 0), -1, np.int64), 0.0
+    wanted = (0 if actors is None else actors.shape[1]) if people is None else people
+    resumed = []
+    while bodies and (chosen.shape[2] < max(wanted, 1) or people is None):
+        person = chosen.shape[2]
+        logged = actors is not None and person < actors.shape[1]
+        rank = [(body[2][person] if logged else 0.0, body[3]) for body in bodies]
+        first = bodies.pop(max(range(len(rank)), key=rank.__getitem__))
+        if person >= max(wanted, 1) and first[3] < total / 2:
+            break
+        total = total or first[3]
+        owner = np.full(len(time_s), -1, np.int64)
+        owner[first[1]] = first[0]
+        for body in sorted(bodies, key=lambda body: -body[3]):
+            overlap = np.mean(owner[body[1]] >= 0) > _MAX_OVERLAP_SHARE
+            if not overlap and (not logged or body[2][person] > 0):
+                owner[body[1]] = body[0]
+                bodies.remove(body)
+        mine = (track == owner[:, None]) & (track >= 0)
+        choice = np.where(mine.any(axis=1), mine.argmax(axis=1), -1)[:, None, None]
+        chosen = np.concatenate([chosen, choice], axis=2)
+        resumed.append(len(np.unique(owner[owner >= 0])) - 1)
+    while chosen.shape[2] < max(wanted, 1):
+        chosen, resumed = np.append(chosen, np.full((len(time_s), 1, 1), -1), axis=2), [*resumed, 0]
+    doubts = ("",) * chosen.shape[2]
+    return _counted(chosen, seen, np.array(resumed, np.int64), {}, doubts, (), ())
+
+
 def _noise_of_logs_m(seen: Bodies, logs: Float, most_m: float) -> float:
     """Estimate the standard deviation on each axis (m) of the logs [T, A, 3] of several people."""
     sure = np.isfinite(seen.spread) & (seen.views > 2)

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Index, Int64
+from pipelines.geometry.arrays import Bool, Float, Index, Int64
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, body_model
+from pipelines.geometry.noise import UNKNOWN_SIGMA
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.geometry.rig import BONE, BONES, SIDES
-from pipelines.geometry.triangulation import STATUS, Triangulation, Views
-from pipelines.reconstruction.body_fit import BodyFit, Landmarks, fit_body, landmarks_of
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
+from pipelines.reconstruction.body_fit import BodyFit, Landmarks, Rays, fit_body, landmarks_of
 from pipelines.reconstruction.observations import Observations
+from pipelines.reconstruction.one_camera import (
+    STATED_STATURE_SIGMA_M,
+    STATURE_M,
+    UNKNOWN_LEVEL_SIGMA_M,
+    GroundHeight,
+    fit_seen_body,
+)
+from pipelines.session.errors import DataError
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, MovingBody
 from pipelines.session.tables import BODY_ROTATION_COLUMNS, load_bodies
 
@@ -96,6 +105,131 @@ def _mean_known(covariance: Float) -> Float:
     size, axes = np.linalg.eigh((mean + np.swapaxes(mean, -1, -2)) / 2)
     found: Float = (axes * np.maximum(size, 0.0)[:, None]) @ np.swapaxes(axes, -1, -2)
     return found
+
+
+# --- one camera ----------------------------------------------------------------------------------------
+
+
+class OneCamera(NamedTuple):
+    """Bodies from one camera, and their landmarks in the place of triangulated joints."""
+
+    bodies: list[BodyFit | None]
+    result: Triangulation
+    with_second_drone_mm: float | None  # error that a second drone would leave
+
+
+def bodies_of_one_camera(
+    observations: Observations,
+    views: Views,
+    *,
+    ground: Callable[[Float], tuple[Float, Float]] | None,
+    of_map: bool,
+    stature_m: float | None,
+) -> OneCamera:
+    """Fit a body to each person whom the only camera sees.
+
+    Args:
+        observations: of one camera.
+        views: the same, one row for each joint-frame.
+        ground: gives the height of the ground under places [N, 3], NaN where it is unknown, and its error.
+        of_map: the height is that of the top of a voxel, and the error its side.
+        stature_m: as stated, None if nobody did.
+
+    Raises:
+        DataError: the landmarks of the skeleton are not known, or the camera has no pose.
+    """
+    times, people, joints, _ = observations.confidence.shape
+    known = landmarks_of(observations.joints)
+    if known is None:
+        raise DataError(
+            "the skeleton of the keypoints",
+            "has no known places on the body, without which one camera shows no distance",
+            "use a detector of COCO, BODY_25 or BlazePose, or add a camera",
+            code="no-views",
+        )
+    landmarks, columns = known
+    noise = observations.pose_sigma
+    pose_sigma = np.tile(UNKNOWN_SIGMA, (times, 1)) if noise is None else noise[:, 0]
+    height = _height_of(ground, observations.position[:, 0], 0.5 if of_map else 0.0)
+    stature = STATURE_M if stature_m is None else (stature_m, STATED_STATURE_SIGMA_M)
+    place, status = np.full((times, people, joints, 3), np.nan), np.zeros((times, people, joints), np.int8)
+    covariance = np.full((times, people, joints, 3, 3), np.nan)
+    seen = np.isfinite(observations.rays[..., 0, :]).all(axis=-1) & (observations.confidence[..., 0] > 0)
+    seen &= np.isfinite(observations.position[:, None, None, 0]).all(axis=-1)
+    status[:] = np.where(seen, STATUS.index("few_views"), STATUS.index("not_detected"))
+    bodies: list[BodyFit | None] = []
+    for person in range(people):
+        found = fit_seen_body(
+            landmarks,
+            observations.t_ns,
+            _rays_of(observations, person, columns, seen[:, person, columns]),
+            height,
+            stature,
+            pose_sigma,
+        )
+        bodies.append(None if found is None else found.body)
+        if found is not None:
+            at = np.ix_(found.body.row, np.array([person]), columns)
+            shown = seen[at][:, 0]
+            place[at] = np.where(shown[..., None], found.place, np.nan)[:, None]
+            covariance[at] = np.where(shown[..., None, None], found.covariance, np.nan)[:, None]
+            status[at] = np.where(shown, STATUS.index("ok"), status[at][:, 0])[:, None]
+    points, ok = place.reshape(-1, 3), (status == STATUS.index("ok")).reshape(-1, 1)
+    result = Triangulation(
+        points,
+        ok,
+        status.ravel(),
+        covariance.reshape(-1, 3, 3),
+        ok[:, 0].astype(np.int64),
+        reprojection_px(views, points),
+    )
+    return OneCamera(bodies, result, _with_second_drone_mm(views, result, pose_sigma))
+
+
+def _rays_of(observations: Observations, person: int, columns: Index, seen: Bool) -> Rays:
+    """Return the rays of one person's landmarks in the only camera, in the world."""
+    xy = np.where(seen[..., None], observations.rays[:, person, columns, 0], 0.0)
+    ray = np.concatenate([xy, np.ones((*seen.shape, 1))], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    ray = np.einsum("tij,tkj->tki", np.nan_to_num(observations.rotation[:, 0]), ray)
+    confidence = observations.confidence[:, person, columns, 0]
+    sigma = 1 / np.where(seen, confidence, 1.0)
+    camera = np.nan_to_num(observations.position[:, 0])
+    return Rays(camera, np.where(seen[..., None], ray, 0.0), sigma)
+
+
+def _height_of(
+    ground: Callable[[Float], tuple[Float, Float]] | None, camera: Float, lower: float
+) -> GroundHeight:
+    """Return heights that are known everywhere; they are `lower` times their error below the given ones."""
+    flat, sigma_m = 0.0, UNKNOWN_LEVEL_SIGMA_M
+    if ground is not None:
+        heights, errors = ground(camera[np.isfinite(camera).all(axis=1)])
+        if np.isfinite(heights).any():
+            flat, sigma_m = float(np.nanmedian(heights)), float(np.nanmin(errors)) * max(lower, 1 - lower)
+
+    def under(places: Float) -> Float:
+        if ground is None:
+            return np.zeros(len(places))
+        heights, errors = ground(places)
+        return np.where(np.isfinite(heights), heights, flat) - lower * errors
+
+    return GroundHeight(under, sigma_m)
+
+
+def _with_second_drone_mm(views: Views, result: Triangulation, pose_sigma: Float) -> float | None:
+    """Predict the error with a second drone as far away, whose rays cross at right angles.
+
+    With the error s of a ray across, the trace of the covariance is 2.5 s^2 (docs/estimate.md).
+    """
+    known = np.isfinite(result.points).all(axis=1)
+    if not known.any():
+        return None
+    moment = views.pose_index[known]
+    distance = np.linalg.norm(result.points[known] - views.position[moment, 0], axis=1)
+    position, rotation = pose_sigma[moment].T
+    square = position**2 + distance**2 * (rotation**2 + (views.pixel_sigma[0] / views.focal[0]) ** 2)
+    return 1e3 * float(np.sqrt(2.5 * square.mean()))
 
 
 # --- tables --------------------------------------------------------------------------------------------

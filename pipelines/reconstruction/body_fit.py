@@ -61,6 +61,8 @@ _LEAST_SIGMA_M = 1e-3
 _MOST_SIGMA_M = 100.0
 # A trunk that is shorter or narrower than this has no directions.
 _LEAST_TRUNK_M = 0.02
+# A landmark that a step puts behind the camera counts as this far before it.
+_LEAST_DEPTH_M = 0.3
 # A longer step leaves the range of the linear model.
 _LONGEST_STEP_RAD = 0.5
 
@@ -143,46 +145,93 @@ class BodyFit:
 
 
 @dataclass(frozen=True)
-class _Shared:
-    """Unknowns that all moments share, G = 12 + 3 K: the shape, and offsets [K, 3] from the table."""
+class Shared:
+    """Unknowns that all moments share, G = 12 + 3 K + 1.
+
+    They are the shape, offsets [K, 3] from the table, and the height of the ground over where it is thought
+    to be, which one camera alone needs (`one_camera`).
+    """
 
     shape: Float
     offset: Float
+    level_m: float = 0.0
 
     @property
-    def deviation(self) -> Float:
-        """The difference [G] from the mean of the prior."""
-        return np.concatenate([self.shape - MEAN_SHAPE, self.offset.ravel()])
+    def vector(self) -> Float:
+        """All of them [G]."""
+        return np.concatenate([self.shape, self.offset.ravel(), [self.level_m]])
 
-    def moved(self, step: Float) -> _Shared:
-        return _Shared(self.shape + step[:12], self.offset + step[12:].reshape(-1, 3))
+    def moved(self, step: Float) -> Shared:
+        """Add a step [G]."""
+        offset = self.offset + step[12:-1].reshape(-1, 3)
+        return Shared(self.shape + step[:12], offset, self.level_m + float(step[-1]))
 
 
 @dataclass(frozen=True)
-class _Poses:
+class SharedPrior:
+    """Normal distribution of the shared unknowns."""
+
+    mean: Float  # [G]
+    precision: Float  # [G, G]
+
+    def cost(self, shared: Shared) -> float:
+        """Compute the cost of values."""
+        away = shared.vector - self.mean
+        return float(away @ self.precision @ away)
+
+
+@dataclass(frozen=True)
+class Poses:
     """Unknowns of every moment, D = 3 + 66: the root [N, 3] and world rotations [N, 22, 3, 3]."""
 
     root: Float
     turn: Float
 
-    def moved(self, step: Float) -> _Poses:
+    def moved(self, step: Float) -> Poses:
+        """Add steps [N, D] of roots and rotation vectors in the world."""
         vector = step[:, 3:].reshape(-1, len(BONES), 3)
         size = np.linalg.norm(vector, axis=-1, keepdims=True)
         vector = vector * np.minimum(1.0, _LONGEST_STEP_RAD / np.maximum(size, 1e-12))
         step_turn = matrix_from_quaternion(quaternion_from_rotation_vector(vector))
-        return _Poses(self.root + step[:, :3], step_turn @ self.turn)
+        return Poses(self.root + step[:, :3], step_turn @ self.turn)
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Places:
     """Landmarks of N moments: places [N, K, 3] m, 0 where missing, and roots of weights [N, K, 3, 3]."""
 
     place: Float
     root_weight: Float  # L^T of the inverse covariance L L^T; 0 where missing
 
+    def near(self, _: Float) -> Places:
+        """Return itself: places do not depend on where the fit has the landmarks."""
+        return self
+
 
 @dataclass(frozen=True)
-class _Normal:
+class Rays:
+    """Landmarks of N moments as one camera sees them: directions [N, K, 3] in the world, 0 where missing."""
+
+    camera: Float  # [N, 3] m
+    direction: Float
+    sigma: Float  # [N, K] rad per axis, above 0
+
+    def near(self, points: Float) -> Places:
+        """Return places and weights that have the errors and derivatives of directions to points [N, K, 3].
+
+        With u from the camera to a point and z = u d along the ray d, the error is u / z - d. That is the
+        weight (1 - u d' / z) / z times the point less its place z d on the ray.
+        """
+        away = points - self.camera[:, None]
+        depth = np.maximum(np.sum(away * self.direction, axis=-1), _LEAST_DEPTH_M)[..., None]
+        seen = np.asarray(self.direction.any(axis=-1))[..., None, None]
+        weight = np.eye(3) - (away / depth)[..., None] * self.direction[..., None, :]
+        weight = np.where(seen, weight / (depth * self.sigma[..., None])[..., None], 0.0)
+        return Places(self.camera[:, None] + depth * self.direction, weight)
+
+
+@dataclass(frozen=True)
+class Normal:
     """Normal equations: of poses [N, D, D], of shared unknowns [G, G] and between; and minus gradients."""
 
     cost: Float  # [N]
@@ -218,7 +267,7 @@ def fit_body(
     if not len(row):
         return None
     model = body_model()
-    points = _Points(model, landmarks)
+    points = Points(model, landmarks)
     chosen = row[_apart(t_ns[row])]
     first = _first_poses(model, landmarks, place[chosen])
     shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], errors(chosen)[0]))
@@ -246,13 +295,13 @@ def fit_body(
     )
 
 
-def _seen(place: Float, covariance: Float) -> _Seen:
+def _seen(place: Float, covariance: Float) -> Places:
     """Invert the covariances of landmarks [N, K, 3]; a landmark without a place has no weight."""
     known = np.asarray(np.isfinite(place).all(axis=-1, keepdims=True))
     variance, axes = np.linalg.eigh(np.where(known[..., None], covariance, np.eye(3)))
     sigma = np.sqrt(np.clip(variance, 0.0, _MOST_SIGMA_M**2) + _LEAST_SIGMA_M**2)
     root = np.einsum("...ij,...j,...kj->...ik", axes, 1 / sigma, axes) * known[..., None]
-    return _Seen(np.where(known, place, 0.0), root)
+    return Places(np.where(known, place, 0.0), root)
 
 
 def _apart(t_ns: Int64) -> Index:
@@ -265,30 +314,32 @@ def _apart(t_ns: Int64) -> Index:
 # --- equations -----------------------------------------------------------------------------------------
 
 
-class _Points:
+class Points:
     """Landmarks, and joints of the bones, as functions of pose and shared unknowns."""
 
     def __init__(self, model: BodyModel, landmarks: Landmarks) -> None:
-        self.bone = landmarks.bone
+        """Take the reach of every point."""
+        self.model, self.bone = model, landmarks.bone
         self.reach = model.reach(landmarks.bone, landmarks.offset)  # [1 + 11, K, 22, 3]
         every = np.arange(len(BONES))
         self.centres = model.reach(every, np.zeros((len(BONES), 3)))
-        self.precision = _prior_precision(landmarks)  # [G, G] of shared unknowns
+        self.prior = shared_prior(landmarks)
 
-    def vectors(self, shared: _Shared) -> Float:
+    def vectors(self, shared: Shared) -> Float:
         """Return the vectors u [K, 22, 3] of the landmarks, relative to the stature."""
         found: Float = np.tensordot(np.array([1.0, *shared.shape[1:]]), self.reach, 1)
         found[np.arange(len(self.bone)), self.bone] += shared.offset
         return found
 
     def _whitened(
-        self, poses: _Poses, seen: _Seen, shared: _Shared
+        self, poses: Poses, seen: Places | Rays, shared: Shared
     ) -> tuple[Float, Float, Float, Float, Float]:
         """Return arms R_b u_b [N, K, 22, 3], bounded weights, errors, cost [N] and slopes by poses."""
         stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
         arms = np.einsum("nbij,kbj->nkbi", poses.turn, self.vectors(shared), optimize=True)
-        error = seen.place - poses.root[:, None] - stature * arms.sum(axis=2)
-        white = np.einsum("nkij,nkj->nki", seen.root_weight, error)
+        points = poses.root[:, None] + stature * arms.sum(axis=2)
+        seen = seen.near(points)
+        white = np.einsum("nkij,nkj->nki", seen.root_weight, seen.place - points)
         square = np.sum(white**2, axis=-1)
         bounded = 1 / np.sqrt(1 + square / _CAUCHY**2)[..., None]
         root = seen.root_weight * bounded[..., None]
@@ -299,7 +350,7 @@ class _Points:
         cost = _CAUCHY**2 * np.log1p(square / _CAUCHY**2).sum(axis=1)
         return arms, root, white * bounded, cost, slope.reshape(count, 3 * many, -1)
 
-    def normal(self, poses: _Poses, seen: _Seen, shared: _Shared, *, whole: bool) -> _Normal:
+    def normal(self, poses: Poses, seen: Places | Rays, shared: Shared, *, whole: bool) -> Normal:
         """Build the normal equations; those of shared unknowns only if `whole`."""
         stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
         arms, root, errors, cost, slope = self._whitened(poses, seen, shared)
@@ -308,46 +359,89 @@ class _Points:
         cost = cost + _add_ranges(poses.turn, pose, right)
         if not whole:
             empty = np.zeros((0, 0))
-            return _Normal(cost, pose, right, empty, empty, empty)
+            return Normal(cost, pose, right, empty, empty, empty)
 
         turned = poses.turn.transpose(0, 2, 1, 3).reshape(-1, 3 * len(BONES))
         by_mode = turned @ self.reach[1:].reshape(-1, 3 * len(BONES)).T
         by_mode = by_mode.reshape(count, 3, -1, many).transpose(0, 3, 1, 2)  # [N, K, 3, 11]
         by_shape = root @ np.concatenate([arms.sum(axis=2)[..., None], stature * by_mode], axis=-1)
         by_offset = stature * root @ poses.turn[:, self.bone]
-        by_shared = np.zeros((count, many, 3, 12 + 3 * many))
+        by_shared = np.zeros((count, many, 3, 13 + 3 * many))
         by_shared[..., :12] = by_shape
         for k in range(many):
             by_shared[:, k, :, 12 + 3 * k : 15 + 3 * k] = by_offset[:, k]
         shares = by_shared.reshape(count, 3 * many, -1)
         flat = shares.reshape(-1, shares.shape[-1])
-        return _Normal(
+        return Normal(
             cost,
             pose,
             right,
-            flat.T @ flat + self.precision,
-            flat.T @ white.ravel() - self.precision @ shared.deviation,
+            flat.T @ flat + self.prior.precision,
+            flat.T @ white.ravel() - self.prior.precision @ (shared.vector - self.prior.mean),
             transposed @ shares,
         )
 
-    def prior_cost(self, shared: _Shared) -> float:
-        """Compute the cost of the shared unknowns."""
-        return float(shared.deviation @ self.precision @ shared.deviation)
+    def spread(
+        self, poses: Poses, shared: Shared, covariance: Float, answer: Float, shared_covariance: Float
+    ) -> tuple[Float, Float]:
+        """Compute places [N, K, 3] and covariances [N, K, 3, 3] of the landmarks; see `_spread`."""
+        place, slope, by_shared = _slopes(poses, shared, self.reach, self.vectors(shared), answer)
+        for k, bone in enumerate(self.bone.tolist()):
+            by_shared[:, k, :, 12 + 3 * k : 15 + 3 * k] += shared.shape[0] * poses.turn[:, bone]
+        return place, _spread(slope, by_shared, covariance, shared_covariance)
+
+    def spread_of_joints(
+        self, poses: Poses, shared: Shared, covariance: Float, answer: Float, shared_covariance: Float
+    ) -> tuple[Float, Float, Float]:
+        """Compute covariances of rotations [N, 22, 3, 3], and joints of the bones with theirs."""
+        count, every = len(poses.root), np.arange(len(BONES))
+        own = covariance[:, 3:, 3:].reshape(count, len(BONES), 3, len(BONES), 3)
+        turning = own[:, every, :, every].transpose(1, 0, 2, 3)
+        by_answer = answer[:, 3:].reshape(count, len(BONES), 3, -1)
+        vectors = np.tensordot(np.array([1.0, *shared.shape[1:]]), self.centres, 1)
+        place, slope, by_shared = _slopes(poses, shared, self.centres, vectors, answer)
+        return (
+            turning + _carried(by_answer, shared_covariance),
+            place,
+            _spread(slope, by_shared, covariance, shared_covariance),
+        )
 
 
-def _prior_precision(landmarks: Landmarks) -> Float:
-    """Return the inverse prior covariance [G, G] of shape and offsets."""
+def _slopes(
+    poses: Poses, shared: Shared, reach: Float, vectors: Float, answer: Float
+) -> tuple[Float, Float, Float]:
+    """Compute points [N, K, 3] and their derivatives by poses and by shared unknowns that poses follow."""
+    stature, count = shared.shape[0], len(poses.root)
+    arms = np.einsum("nbij,kbj->nkbi", poses.turn, vectors, optimize=True)
+    by_part = np.zeros((*arms.shape[:2], 3, 1 + len(BONES), 3))
+    by_part[:, :, :, 0] = np.eye(3)
+    by_part[:, :, :, 1:] = np.swapaxes(-stature * cross_matrix(arms), 2, 3)
+    slope = by_part.reshape(count, len(vectors), 3, -1)
+    by_mode = np.einsum("nbij,mkbj->nkim", poses.turn, reach[1:], optimize=True)
+    by_shared = np.einsum("nkid,ndg->nkig", slope, answer, optimize=True)
+    by_shared[..., :12] += np.concatenate([arms.sum(axis=2)[..., None], stature * by_mode], axis=-1)
+    return poses.root[:, None] + stature * arms.sum(axis=2), slope, by_shared
+
+
+def _spread(slope: Float, by_shared: Float, covariance: Float, shared_covariance: Float) -> Float:
+    """Carry covariances of poses [N, D, D] and of shared unknowns [G, G] to points [N, K]."""
+    own = np.einsum("nkid,nde,nkje->nkij", slope, covariance, slope, optimize=True)
+    return np.asarray(own + _carried(by_shared, shared_covariance), np.float64)
+
+
+def shared_prior(landmarks: Landmarks) -> SharedPrior:
+    """Return the prior of shape, offsets and level."""
     sigma, same = landmarks.body_sigma, landmarks.bone[:, None] == landmarks.bone
     share = np.where(same & (same.sum(axis=1) > 2), _ALIKE_IN_A_GROUP, 0.0)
     np.fill_diagonal(share, 1.0)
-    precision = np.zeros((12 + 3 * len(sigma),) * 2)
+    precision = np.eye(13 + 3 * len(sigma))
     precision[:12, :12] = np.diag(SHAPE_SIGMA**-2)
-    precision[12:, 12:] = np.kron(np.linalg.inv(share * np.outer(sigma, sigma)), np.eye(3))
-    return precision
+    precision[12:-1, 12:-1] = np.kron(np.linalg.inv(share * np.outer(sigma, sigma)), np.eye(3))
+    return SharedPrior(np.concatenate([MEAN_SHAPE, np.zeros(3 * len(sigma) + 1)]), precision)
 
 
 @dataclass(frozen=True)
-class _Ranges:
+class JointRanges:
     """Ranges of the 21 joints, as rotation vectors of a bone from the middle frame, rad."""
 
     bone: Index  # [21]
@@ -360,7 +454,7 @@ class _Ranges:
 
 
 @cache
-def _ranges() -> _Ranges:
+def joint_ranges() -> JointRanges:
     """Read the table of ranges; only an arm, which turns by 180 degrees, has a middle that is not neutral."""
     rows = []
     for name, parent in PARENT.items():
@@ -376,20 +470,20 @@ def _ranges() -> _Ranges:
         usual = -middle + [0.0, np.radians(_USUAL_ELBOW_DEG) * (part == "forearm"), 0.0]
         limits = low - middle, high - middle
         rows.append((BONE[name], BONE[parent], turn, usual, _USUAL_SHARE * half, *limits))
-    return _Ranges(*(np.array(column) for column in zip(*rows, strict=True)))
+    return JointRanges(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def _add_ranges(turn: Float, pose: Float, right: Float) -> Float:
     """Add the ranges of joints to normal equations, in place; return their cost [N]."""
-    ranges = _ranges()
-    bones, parents, low, high = ranges.bone, ranges.parent, ranges.low, ranges.high
-    frame = turn[:, parents] @ ranges.middle  # world from the middle
+    usual = joint_ranges()
+    bones, parents, low, high = usual.bone, usual.parent, usual.low, usual.high
+    frame = turn[:, parents] @ usual.middle  # world from the middle
     vector = rotation_vector_from_quaternion(
         quaternion_from_matrix(np.swapaxes(frame, -1, -2) @ turn[:, bones])
     )
     beyond = np.where(vector < low, vector - low, np.where(vector > high, vector - high, 0.0))
-    weight, steep = ranges.sigma**-2, np.where(beyond == 0.0, 0.0, _BOUND_RAD**-2)
-    away = vector - ranges.usual
+    weight, steep = usual.sigma**-2, np.where(beyond == 0.0, 0.0, _BOUND_RAD**-2)
+    away = vector - usual.usual
     cost = np.sum(weight * away**2 + steep * beyond**2, axis=(1, 2))
 
     slope = _inverse_left_jacobian(vector) @ np.swapaxes(frame, -1, -2)
@@ -419,18 +513,18 @@ def _inverse_left_jacobian(vector: Float) -> Float:
 # --- solving -------------------------------------------------------------------------------------------
 
 
-def _fit_shared(points: _Points, poses: _Poses, seen: _Seen) -> tuple[_Shared, Float]:
+def _fit_shared(points: Points, poses: Poses, seen: Places | Rays) -> tuple[Shared, Float]:
     """Fit shape and offsets with the poses of some moments; return them and their covariance [G, G]."""
-    shared = _Shared(MEAN_SHAPE.copy(), np.zeros((len(points.bone), 3)))
+    shared = Shared(MEAN_SHAPE.copy(), np.zeros((len(points.bone), 3)))
     normal = points.normal(poses, seen, shared, whole=True)
-    cost, damping = normal.cost.sum() + points.prior_cost(shared), 1e-3
+    cost, damping = normal.cost.sum() + points.prior.cost(shared), 1e-3
     for _ in range(_SHAPE_STEPS):
         inverse_between, inverse_right, reduced, reduced_right = _reduced(normal, damping)
         step = np.asarray(np.linalg.solve(reduced, reduced_right), np.float64)
         new_shared = shared.moved(step)
         new_poses = poses.moved(inverse_right - inverse_between @ step)
         new = points.normal(new_poses, seen, new_shared, whole=True)
-        new_cost = new.cost.sum() + points.prior_cost(new_shared)
+        new_cost = new.cost.sum() + points.prior.cost(new_shared)
         if new_cost > cost:
             damping *= 10
             continue
@@ -442,7 +536,7 @@ def _fit_shared(points: _Points, poses: _Poses, seen: _Seen) -> tuple[_Shared, F
     return shared, np.asarray(np.linalg.inv(reduced), np.float64)
 
 
-def _reduced(normal: _Normal, damping: float) -> tuple[Float, Float, Float, Float]:
+def _reduced(normal: Normal, damping: float) -> tuple[Float, Float, Float, Float]:
     """Eliminate the poses; return their answers to shared unknowns and right sides, and what is left."""
     solved = np.linalg.solve(
         _damped(normal.pose, np.full(len(normal.pose), damping)),
@@ -462,20 +556,20 @@ def _damped(pose: Float, damping: Float) -> Float:
     return found
 
 
-def _fit_poses(
-    points: _Points, poses: _Poses, seen: _Seen, shared: _Shared, shared_covariance: Float
-) -> tuple[Float, Float, Float, Float]:
-    """Fit each moment's pose; return rotations and joints of the bones, each with covariances."""
+def settle(
+    points: Points, poses: Poses, seen: Places | Rays, shared: Shared, steps: int
+) -> tuple[Poses, Float]:
+    """Fit each moment's pose by itself; return also the costs [N]."""
     normal = points.normal(poses, seen, shared, whole=False)
     damping = np.full(len(poses.root), 1e-3)
-    for _ in range(_POSE_STEPS):
+    for _ in range(steps):
         step = np.linalg.solve(_damped(normal.pose, damping), normal.pose_right[..., None])[..., 0]
         new_poses = poses.moved(np.asarray(step, np.float64))
         new = points.normal(new_poses, seen, shared, whole=False)
         better = new.cost <= normal.cost
         done = bool((normal.cost - new.cost < 0.03)[better].all() and better.all())
         damping = np.where(better, damping / 5, damping * 10)
-        poses = _Poses(
+        poses = Poses(
             np.where(better[:, None], new_poses.root, poses.root),
             np.where(better[:, None, None, None], new_poses.turn, poses.turn),
         )
@@ -487,28 +581,19 @@ def _fit_poses(
         )
         if done:
             break
-    whole = points.normal(poses, seen, shared, whole=True)
-    inverse = np.linalg.inv(whole.pose)
-    answer = -inverse @ whole.between  # of the pose to shared unknowns
-    count = len(poses.root)
-    by_answer = answer[:, 3:].reshape(count, len(BONES), 3, -1)
-    own = inverse[:, 3:, 3:].reshape(count, len(BONES), 3, len(BONES), 3)
-    every = np.arange(len(BONES))
-    rotation_covariance = own[:, every, :, every].transpose(1, 0, 2, 3)
-    rotation_covariance = rotation_covariance + _carried(by_answer, shared_covariance)
+    return poses, normal.cost
 
-    stature, shares = shared.shape[0], np.array([1.0, *shared.shape[1:]])
-    arms = np.einsum("nbij,kbj->nkbi", poses.turn, np.tensordot(shares, points.centres, 1), optimize=True)
-    centre = poses.root[:, None] + stature * arms.sum(axis=2)
-    by_part = np.zeros((count, len(BONES), 3, 1 + len(BONES), 3))
-    by_part[:, :, :, 0] = np.eye(3)
-    by_part[:, :, :, 1:] = np.swapaxes(-stature * cross_matrix(arms), 2, 3)
-    slope = by_part.reshape(count, len(BONES), 3, -1)
-    by_mode = np.einsum("nbij,mkbj->nkim", poses.turn, points.centres[1:], optimize=True)
-    by_shared = np.einsum("nkid,ndg->nkig", slope, answer, optimize=True)
-    by_shared[..., :12] += np.concatenate([arms.sum(axis=2)[..., None], stature * by_mode], axis=-1)
-    white = np.einsum("nkid,nde,nkje->nkij", slope, inverse, slope, optimize=True)
-    return poses.turn, rotation_covariance, centre, white + _carried(by_shared, shared_covariance)
+
+def _fit_poses(
+    points: Points, poses: Poses, seen: Places, shared: Shared, shared_covariance: Float
+) -> tuple[Float, Float, Float, Float]:
+    """Fit each moment's pose; return rotations and joints of the bones, each with covariances."""
+    poses, _ = settle(points, poses, seen, shared, _POSE_STEPS)
+    whole = points.normal(poses, seen, shared, whole=True)
+    inverse = np.asarray(np.linalg.inv(whole.pose), np.float64)
+    answer = -inverse @ whole.between  # of the pose to shared unknowns
+    turning, *joints = points.spread_of_joints(poses, shared, inverse, answer, shared_covariance)
+    return poses.turn, turning, joints[0], joints[1]
 
 
 def _carried(slope: Float, covariance: Float) -> Float:
@@ -520,7 +605,7 @@ def _carried(slope: Float, covariance: Float) -> Float:
 # --- first poses ---------------------------------------------------------------------------------------
 
 
-def _first_poses(model: BodyModel, landmarks: Landmarks, place: Float) -> _Poses:
+def _first_poses(model: BodyModel, landmarks: Landmarks, place: Float) -> Poses:
     """Turn trunk and limbs the way landmarks [N, K, 3] point; a bone without them as its parent."""
     missing = np.full_like(place[:, 0], np.nan)
     of = {name: place[:, k] for k, name in enumerate(landmarks.joints)}
@@ -558,7 +643,7 @@ def _first_poses(model: BodyModel, landmarks: Landmarks, place: Float) -> _Poses
         _put(turn, (f"{side}_foot", f"{side}_toes"), foot, shank)
     hips = (steps[BONE["left_thigh"]] + steps[BONE["right_thigh"]]) / 2
     root = (at("left_hip") + at("right_hip")) / 2 - MEAN_SHAPE[0] * pelvis @ hips
-    return _Poses(root, turn)
+    return Poses(root, turn)
 
 
 def _put(turn: Float, bones: tuple[str, ...], found: Float, otherwise: Float) -> None:

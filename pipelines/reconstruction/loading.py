@@ -92,15 +92,11 @@ def load_cameras(
             it raw confidences are used; those of imported keypoints are never calibrated.
 
     Raises:
-        DataError: fewer than two cameras have keypoints, or they share no joint.
+        DataError: no camera has keypoints, or cameras share no joint.
     """
     sources = _keypoints(folder, description, detected)
-    if len(sources) < 2:
-        raise NoViewsError(
-            description.flight,
-            f"{', '.join(sources) or 'no camera'} alone shows people, and a place in space needs two views",
-            "add a camera that films the same people at the same time",
-        )
+    if not sources:
+        raise NoViewsError(description.flight, "has no camera with pictures or keypoints", "add one")
     joints = _common_joints(folder, sources)
     warnings: list[str] = []
     cameras = []
@@ -113,9 +109,9 @@ def load_cameras(
 
 
 def _common_joints(folder: Path, sources: Mapping[str, _Keypoints]) -> tuple[str, ...]:
-    """List the joints that at least two cameras know, in the order of the camera that knows the most."""
-    known = [source.joints for source in sources.values()]
-    shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) > 1]
+    """List the joints that two cameras know, or the only one, in the order of the camera that knows most."""
+    known, least = [source.joints for source in sources.values()], min(2, len(sources))
+    shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) >= least]
     if not shared:
         raise DataError(
             folder, "has no joint that two cameras' detectors both know", "use one skeleton for all"

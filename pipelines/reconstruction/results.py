@@ -343,6 +343,7 @@ def method_used(
     refinement = metrics.get("refinement")
     absent = "robust fits calibrated still cameras better" if method == "auto" else "the method has none"
     reason = absent if refinement is None else refinement["fallback"]
+    reason = None if len(cameras) == 1 else reason
     learned = refinement is not None and reason is None and refinement["pose_noise"] == "estimated"
     guessed = learned or bool(used["background"]["cameras"])
     exact = all(camera.static for camera in cameras)
@@ -351,14 +352,15 @@ def method_used(
         "body": {"used": reason is None, "reason": reason},
         "pose_noise": known or ("estimated" if guessed and not exact else "none"),
     }
-    return used | {"summary": _summary(used, clocks_s)}
+    people = "the size of people, their feet on the ground, and motion" if len(cameras) == 1 else None
+    return used | {"summary": _summary(used, clocks_s, people or "motion and bones")}
 
 
-def _summary(used: Mapping[str, Any], clocks_s: Mapping[str, tuple[float, float]]) -> str:
+def _summary(used: Mapping[str, Any], clocks_s: Mapping[str, tuple[float, float]], people: str) -> str:
     """Write the parts in one line, with estimated clock offsets and their standard deviations."""
     parts = ["keypoints"]
     if used["body"]["used"]:
-        parts.append("motion and bones")
+        parts.append(people)
     for name, text in (("background", "backgrounds of"), ("ground", "ground seen by")):
         if used[name]["cameras"]:
             parts.append(f"{text} {', '.join(used[name]['cameras'])}")
@@ -720,6 +722,10 @@ def verdict(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
         why.append(f"{share:.0%} of the joints were measured")
     if not (used.get("background") or {}).get("cameras"):
         why.append("no background was used: the videos of the cameras show how each of them moved")
+    if cameras == 1:
+        gain = figures.get("with_second_drone_mm")
+        less = "" if gain is None else f": a second drone across would leave about {gain:.0f} mm"
+        why.insert(len(doubts), f"one camera does not measure how far away a person is{less}")
     if cameras == 2:
         why.append("there are two cameras: nothing shows which of them is wrong where they disagree")
     if kind == "estimated":

@@ -33,7 +33,7 @@ STATUS_LABELS = {
     "no_pose": "no camera pose",
 }
 STATUS_REASONS = {
-    "ok": "reconstructed from at least two views that agree",
+    "ok": "reconstructed from views that agree, or placed with the body by a single camera",
     "filled": "the position was filled in between measured ones",
     "few_views": "fewer than two cameras saw the joint at the same time",
     "low_parallax": "the cameras looked along nearly the same line, which leaves the distance undetermined",

@@ -313,6 +313,7 @@ class Description(Entry):
     cameras: dict[str, CameraEntry]
     actor: ActorEntry | None = None  # the only one who was logged, or the first of `actors`
     actors: list[ActorEntry] = []  # person 0, 1, ..., if the manifest names them
+    stature_m: float | None = None  # of the people, as stated
     map: MapEntry | None = None
     truth: TruthEntry | None
     plan: dict[str, PlannedEntry] | None = None  # by camera

@@ -41,7 +41,7 @@ CODES = {
     "no-such-file": "a file or folder is not there",
     "no-such-name": "nothing has the name that was given",
     "no-such-topic": "a log has no such topic",
-    "no-views": "at no time do two cameras have pictures and a pose",
+    "no-views": "at no time do the cameras have pictures, people and a pose",
     "nobody-found": "the detector found no person",
     "not-a-folder": "a file lies where a folder belongs, or a folder where a file does",
     "not-a-session": "a folder is no session, or no whole one",
@@ -95,7 +95,7 @@ class DataError(MocapError):
 
 
 class NoViewsError(DataError):
-    """At no time do two cameras have pictures and a pose."""
+    """At no time do the cameras have pictures, people and a pose."""
 
     code = "no-views"
 

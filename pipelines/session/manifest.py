@@ -621,6 +621,8 @@ class Manifest(YamlModel):
     """Logged positions of the actor."""
     actors: dict[str, ActorSource] = {}
     """Logged positions of several people by name."""
+    stature_m: float | None = Field(None, ge=0.5, le=2.5)
+    """Height of the people who are filmed, m, which one camera needs to tell how far away they are."""
     map: MapSource | None = None
     """Map of the surroundings."""
     truth: TruthSource | None = None

@@ -14,17 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Index
-from pipelines.geometry.body_model import BUILDS, PARTS, SEXES, UNIT_M, body_asset, height_standing
-from pipelines.geometry.poses import multiply
-from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig
-from pipelines.geometry.skinning import (
+from pipelines.geometry.body_model import (
+    BUILDS,
+    PARTS,
+    SEXES,
+    UNIT_M,
     Skin,
     Skinning,
+    body_asset,
+    height_standing,
     make_skin,
     moving_weights,
     neutral_offsets,
     neutral_turns,
 )
+from pipelines.geometry.poses import multiply
+from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig
 from pipelines.session.people import get_skeleton
 from pipelines.simulation.raster import TriangleSurface
 from pipelines.simulation.scenario import Body

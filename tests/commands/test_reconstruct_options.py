@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 import trimesh
 from click.testing import CliRunner, Result
+from ruamel.yaml import YAML
 from scipy.stats import t
 
 from mocap_cli.main import Mocap
@@ -219,7 +220,8 @@ keypoints: {scale: 0.5, missed_share: 0, outlier_share: 0, swap_share: 0}
 
 def test_a_simulated_person_gets_her_body(tmp_path: Path) -> None:
     session = tmp_path / "body.session"
-    succeeds("ingest", simulated(tmp_path, WALKS, "--no-video"), "-o", session)
+    described = simulated(tmp_path, WALKS, "--no-video")
+    succeeds("ingest", described, "-o", session)
     succeeds("reconstruct", session, "--method", "robust")
     figures = json.loads((session / "reconstruct" / "metrics.json").read_text())["body"]["person0"]
     # Three of the standard deviations that are stated.
@@ -234,6 +236,23 @@ def test_a_simulated_person_gets_her_body(tmp_path: Path) -> None:
     knees = both[both["bone"].isin(["left_shank", "right_shank"])]
     away = knees[["x", "y", "z"]].to_numpy() - knees[["x_true", "y_true", "z_true"]].to_numpy()
     assert np.linalg.norm(away, axis=1).mean() < 0.05
+
+    # The first drone by itself, and a stature that is stated.
+    text = described.read_text()
+    manifest = YAML(typ="safe").load(text) | {"stature_m": 1.62}
+    manifest["cameras"] = {"drone1": manifest["cameras"]["drone1"]}
+    manifest["truth"]["poses"] = {"drone1": manifest["truth"]["poses"]["drone1"]}
+    with described.with_name("one.yaml").open("w") as file:
+        YAML().dump(manifest, file)
+    alone = tmp_path / "one.session"
+    succeeds("ingest", described.with_name("one.yaml"), "-o", alone)
+    succeeds("reconstruct", alone)
+    metrics = json.loads((alone / "reconstruct" / "metrics.json").read_text())
+    assert metrics["root_mpjpe_mm"] < 110 < metrics["mpjpe_mm"] + 110 < 500
+    assert metrics["verdict"]["expected_error_mm"][2] > metrics["mpjpe_mm"]
+    assert 0 < metrics["with_second_drone_mm"] < metrics["verdict"]["expected_error_mm"][2]
+    assert abs(metrics["body"]["person0"]["stature_m"] - 1.62) < 0.05
+    succeeds("report", alone)
 
     succeeds("export", session, "--to", "mesh", "-o", tmp_path / "out")
     (path,) = (tmp_path / "out").glob("*.glb")

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, SHAPE_SIGMA, body_model, shape_of
+from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, SHAPE_SIGMA, body_model, make_skin, shape_of
 from pipelines.geometry.poses import quaternion_from_rotation_vector
 from pipelines.geometry.rig import BONE, BONES, BodyMotion, joint_centres
-from pipelines.geometry.skinning import make_skin
 from pipelines.simulation.body import _undressed, make_body
 from pipelines.simulation.scenario import Body
 

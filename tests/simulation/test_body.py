@@ -3,9 +3,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from pipelines.geometry.body_model import moving_weights
 from pipelines.geometry.poses import quaternion_from_rotation_vector
 from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES, BodyMotion, joint_centres
-from pipelines.geometry.skinning import moving_weights
 from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.scenario import Body
 

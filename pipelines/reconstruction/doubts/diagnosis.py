@@ -172,14 +172,14 @@ def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | No
 def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doubt]:
     """Find what is odd about a flight, and why, that first that explains the most.
 
-    A flight whose cameras share no time is not doubted here. A world on its side is named where no usual
-    convention turns it upright.
+    A flight of one camera, or whose cameras share no time, is not doubted here. A world on its side is named
+    where no usual convention turns it upright.
 
     Args:
         flight: the flight.
         late: what the backgrounds tell of the cameras' times.
     """
-    if flight is None:
+    if flight is None or len(flight.cameras) < 2:
         return []
     trial = Trial(flight, scene_of(flight))
     base, found = base_of(flight, trial.described)

@@ -12,10 +12,9 @@ import trimesh
 
 from pipelines.formats.scenes.gltf_writing import EXPORT, MESH_EXPORT
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.body_model import body_model, shape_of
+from pipelines.geometry.body_model import Skinning, body_model, shape_of
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector, rotate
 from pipelines.geometry.rig import BONES
-from pipelines.geometry.skinning import Skinning
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, MovingBody
 from tests.formats.exported import START_NS, recording, walking, without
