@@ -26,6 +26,10 @@ COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5,
 """The allowed numbers of distortion coefficients of each model."""
 
 
+# Over the picture's width. A fisheye lens of 220 deg whose circle is half as wide as the picture has 0.13.
+MIN_FOCAL_SHARE = 0.05
+
+
 @dataclass(frozen=True)
 class Intrinsics:
     """The intrinsic parameters of a camera, in pixels of a `width` x `height` picture.
@@ -52,6 +56,10 @@ class Intrinsics:
             problems.append(f"picture size {self.width} x {self.height} is not positive whole numbers")
         if not all(np.isfinite(focal) and focal > 0 for focal in (self.fx, self.fy)):
             problems.append(f"focal lengths {self.fx}, {self.fy} px are not positive")
+        elif min(self.fx, self.fy) < MIN_FOCAL_SHARE * self.width:
+            problems.append(
+                f"focal lengths {self.fx:g}, {self.fy:g} px are too short for pictures {self.width} px wide: in mm?"
+            )
         if not np.isfinite([self.cx, self.cy]).all():
             problems.append(f"principal point {self.cx}, {self.cy} px is not finite")
         if not (np.isfinite(self.readout_s) and self.readout_s >= 0):

