@@ -57,9 +57,8 @@ class Intrinsics:
         if not all(np.isfinite(focal) and focal > 0 for focal in (self.fx, self.fy)):
             problems.append(f"focal lengths {self.fx}, {self.fy} px are not positive")
         elif min(self.fx, self.fy) < MIN_FOCAL_SHARE * self.width:
-            problems.append(
-                f"focal lengths {self.fx:g}, {self.fy:g} px are too short for pictures {self.width} px wide: in mm?"
-            )
+            shortest_px = MIN_FOCAL_SHARE * self.width
+            problems.append(f"focal lengths {self.fx:g}, {self.fy:g} are below {shortest_px:g} px: in mm?")
         if not np.isfinite([self.cx, self.cy]).all():
             problems.append(f"principal point {self.cx}, {self.cy} px is not finite")
         if not (np.isfinite(self.readout_s) and self.readout_s >= 0):

@@ -142,7 +142,7 @@ USUAL_MISTAKES: list[tuple[str, Any, str, list[str]]] = [
     ("drone1.pose", None, "bad-value", ["cameras.drone1.pose: ", "of: body"]),
     ("drone1.intrinsics", None, "bad-value", ["cameras.drone1.intrinsics: ", "fx: 1400"]),
     ("drone1.intrinsics.fx", -3, "bad-value", ["cameras.drone1.intrinsics.fx: "]),
-    ("drone1.intrinsics.fx", 24, "bad-value", ["cameras.drone1.intrinsics: ", "24", "1280"]),
+    ("drone1.intrinsics.fx", 24, "bad-value", ["cameras.drone1.intrinsics: ", "24", "64 px"]),
     ("drone1.keypoints", None, "bad-value", ["video or keypoints"]),
     ("drone1.keypoints.file", "drone2.json", "bad-value", ["cameras.drone2.keypoints: ", "drone1"]),
     ("drone1.keypoints.skeleton", "coco-17", "no-such-name", ["coco17", "body25"]),
