@@ -166,7 +166,8 @@ def _poses_of(views: Views) -> _Poses:
     middle = np.where(known[..., None], views.position, 0.0).sum(axis=1) / count
     rotation = views.rotation.reshape(*known.shape, 9)
     rows = np.concatenate([rotation, views.position - middle[:, None]], axis=-1)
-    return _Poses(known, middle, np.where(known[..., None], rows, 0.0))
+    # In one order, so that what reads them is compiled once.
+    return _Poses(known, middle, np.ascontiguousarray(np.where(known[..., None], rows, 0.0)))
 
 
 def _triangulate_block(

@@ -33,14 +33,11 @@ def test_the_detector_and_true_poses_give_the_skeleton(tmp_path: Path, detector:
     assert metrics["mpjpe_mm"] < most_mm
     assert metrics["reconstructed_share"] > 0.95 * 13 / 15
 
-    # Its confidences are weighed by its own calibration, and the report names it.
+    # Its confidences are weighed by its own calibration.
     record = read_json(session / "reconstruct" / "stage.json")
     measured = measured_for(detector)
     assert measured is not None
     assert record["inputs"]["calibration of confidences"] == sha256_of(measured)
-    succeeds("report", session)
-    page = (session / "report" / "index.html").read_text(encoding="utf-8")
-    assert page.count(f">{detector}, ") == 2  # in the row of each camera
 
 
 @pytest.mark.long

@@ -1,3 +1,5 @@
+"""Drafts: what names and notes say, and what pictures and logs show of motion."""
+
 import re
 from collections.abc import Callable
 

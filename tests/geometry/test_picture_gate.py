@@ -65,8 +65,7 @@ def test_where_nothing_errs_grossly_nothing_changes(cameras: int, level: str, co
 
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("constant", [True, False])
-@pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("cameras", [4, 5])
+@pytest.mark.parametrize(("cameras", "level"), [(4, "b"), (5, "a"), (5, "c")])
 def test_outliers_cost_no_more_than_their_views(
     cameras: int, level: str, constant: bool, stated: bool
 ) -> None:

@@ -147,11 +147,10 @@ def test_clocks_that_nearly_fit_are_left_alone() -> None:
     assert common_offset(team, {}, BETWEEN) is None
 
 
-@pytest.mark.parametrize("stated", [True, False])
-@pytest.mark.parametrize("seconds", [0.06, -0.11, 0.74])
+@pytest.mark.parametrize(("seconds", "stated"), [(0.06, False), (-0.11, True), (0.74, False)])
 def test_each_camera_that_turns_has_its_clock_from_its_background(seconds: float, stated: bool) -> None:
     """A log that drifts: 0.1 deg in a second beside up to 22 deg a second."""
-    names = [f"drone{k}" for k in range(4)]
+    names = ["drone0", "drone1"]
     team: list[Any] = [
         replace(late(seconds, 0.3 + 0.9 * k), name=name, drift_deg=0.1) for k, name in enumerate(names)
     ]
@@ -162,7 +161,7 @@ def test_each_camera_that_turns_has_its_clock_from_its_background(seconds: float
     )
     squares = np.square((offset_s + seconds) / sigma_s)
     assert (sigma_s < 0.01).all()
-    assert squares.mean() < 13.3 / 4  # 99 % of chi-square with four degrees of freedom
+    assert squares.mean() < 9.2 / 2  # 99 % of chi-square with two degrees of freedom
 
 
 def test_no_clock_is_found_that_is_known_or_that_nothing_shows() -> None:

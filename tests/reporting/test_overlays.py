@@ -1,3 +1,5 @@
+"""Overlays of pictures: residuals, the worst moment, status and spread of joints between pictures."""
+
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,3 +1,5 @@
+"""The page of a session, and its figures as files."""
+
 import base64
 import hashlib
 import io

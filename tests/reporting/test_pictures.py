@@ -1,3 +1,5 @@
+"""Skeletons, keypoints and ellipses, drawn onto pictures."""
+
 from dataclasses import replace
 
 import numpy as np

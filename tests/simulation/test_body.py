@@ -1,3 +1,5 @@
+"""The simulated body: its size, its rig and its surface."""
+
 from collections import Counter
 
 import numpy as np
