@@ -7,7 +7,6 @@ they tell that all cameras' clocks are alike wrong.
 
 import difflib
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,10 @@ from typing import Any
 from pipelines.detect import BACKGROUND, DETECT, cameras_to_detect, cameras_to_follow, detect, follow
 from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
-from pipelines.reconstruction.background_tracks import Followed, load_tracks
+from pipelines.reconstruction.background_tracks import load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.doubts.remedies import mended
 from pipelines.reconstruction.loading import load_cameras
-from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.parallel import return_freed_arrays
@@ -115,35 +113,23 @@ def _checked(
     folder = session.folder
     description = read_description(folder)
     detected, pictures = _detected(session, description, detector, workers, progress)
-    doubts = _doubts(session, description, detected, pose_noise)
-    alone = ["one camera: its poses were not compared with another view"] * (len(description.cameras) == 1)
-    return Checked(doubts, [*description.warnings, *alone], pictures)
-
-
-def _doubts(
-    session: Session, description: Description, detected: StageRecord | None, pose_noise: str | None
-) -> list[Doubt]:
-    folder = session.folder
     cameras, _ = load_cameras(
         folder, description, detected, min_confidence=MIN_CONFIDENCE, pose_noise=pose_noise
     )
     actors = logged_people(folder, description)
     found, association, _ = find_people(cameras, description.pose_interpolation, actors)
-    return doubts_of(
+    moving = [] if session.intact_record(BACKGROUND.name) is None else [c for c in cameras if not c.static]
+    tracks = {camera.name: load_tracks(folder, camera) for camera in moving}
+    doubts = doubts_of(
         folder,
         description,
         cameras,
         chosen=chosen_detections(cameras, found, association),
-        followed=_followed(session, cameras),
+        followed={name: own for name, own in tracks.items() if own is not None},
         pose_noise=pose_noise,
     )
-
-
-def _followed(session: Session, cameras: Sequence[Camera]) -> dict[str, Followed]:
-    if session.intact_record(BACKGROUND.name) is None:
-        return {}
-    found = {camera.name: load_tracks(session.folder, camera) for camera in cameras if not camera.static}
-    return {name: tracks for name, tracks in found.items() if tracks is not None}
+    alone = ["one camera: its poses were not compared with another view"] * (len(description.cameras) == 1)
+    return Checked(doubts, [*description.warnings, *alone], pictures)
 
 
 def _detected(

@@ -332,12 +332,8 @@ class FoundLog:
     @property
     def span(self) -> TimeSpan:
         """The time from its first message to its last."""
-        spans = [topic.span for topic in self.topics.values() if topic.span]
-        return (
-            TimeSpan(min(s.first_ns for s in spans), max(s.last_ns for s in spans))
-            if spans
-            else TimeSpan(0, 0)
-        )
+        spans = [topic.span for topic in self.topics.values() if topic.span] or [TimeSpan(0, 0)]
+        return TimeSpan(min(s.first_ns for s in spans), max(s.last_ns for s in spans))
 
     @property
     def label(self) -> Label:

@@ -568,14 +568,8 @@ class _Chooser:
         logged = self._camera.logged_film
         if candidate.kind != "intrinsics" or not candidate.topic or logged is None:
             return 0
-        shared = 0
-        for one, other in zip(
-            candidate.topic.strip("/").split("/"), logged.topic.strip("/").split("/"), strict=False
-        ):
-            if one != other:
-                break
-            shared += 1
-        return shared
+        names = [[*each.topic.strip("/").split("/"), ""] for each in (candidate, logged)]
+        return next(k for k, pair in enumerate(zip(*names, strict=False)) if len({*pair}) > 1 or "" in pair)
 
     def _times(self, rivals: Sequence[Proposal]) -> dict[int, float]:
         """Compute how long each overlaps in time with the camera's film, or else with the other logs."""

@@ -91,38 +91,29 @@ def _one_side(side: str, *parts: str) -> tuple[str, ...]:
 
 _COCO17 = ("nose", *_both("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"))
 
+_ARMS = (*_one_side("right", "shoulder", "elbow", "wrist"), *_one_side("left", "shoulder", "elbow", "wrist"))
+_FEET = tuple(f"{side}_{part}" for side in ("left", "right") for part in ("big_toe", "small_toe", "heel"))
 _JOINTS: dict[str, tuple[str, ...]] = {
     "coco17": _COCO17,
     "halpe26": (*_COCO17, "head", "neck", "hip", *_both("big_toe", "small_toe", "heel")),
     "coco18": (
         *("nose", "neck"),
-        *_one_side("right", "shoulder", "elbow", "wrist"),
-        *_one_side("left", "shoulder", "elbow", "wrist"),
+        *_ARMS,
         *_one_side("right", "hip", "knee", "ankle"),
         *_one_side("left", "hip", "knee", "ankle"),
         *("right_eye", "left_eye", "right_ear", "left_ear"),
     ),
     "body25": (
         *("nose", "neck"),
-        *_one_side("right", "shoulder", "elbow", "wrist"),
-        *_one_side("left", "shoulder", "elbow", "wrist"),
+        *_ARMS,
         "hip",
         *_one_side("right", "hip", "knee", "ankle"),
         *_one_side("left", "hip", "knee", "ankle"),
         *("right_eye", "left_eye", "right_ear", "left_ear"),
-        *_one_side("left", "big_toe", "small_toe", "heel"),
-        *_one_side("right", "big_toe", "small_toe", "heel"),
+        *_FEET,
     ),
-    "coco23": (
-        *_COCO17,
-        *_one_side("left", "big_toe", "small_toe", "heel"),
-        *_one_side("right", "big_toe", "small_toe", "heel"),
-    ),
-    "body25b": (
-        *(*_COCO17, "neck", "head"),
-        *_one_side("left", "big_toe", "small_toe", "heel"),
-        *_one_side("right", "big_toe", "small_toe", "heel"),
-    ),
+    "coco23": (*_COCO17, *_FEET),
+    "body25b": (*_COCO17, "neck", "head", *_FEET),
     "blazepose33": (
         "nose",
         *_one_side("left", "eye_inner", "eye", "eye_outer"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -38,6 +39,8 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
         raise DataError(path, "; ".join(dict.fromkeys(problems)), code="bad-value") from None
 
 
+# No file name holds these, and UTF-8 no lone surrogate.
+_IMPOSSIBLE = re.compile("[\0\ud800-\udfff]")
 # A float holds no integer of more bits.
 MAX_INTEGER_BITS = 1024
 
@@ -102,7 +105,7 @@ def _refuse_impossible_values(path: Path, value: object) -> None:
             waiting += [(key, place) for key in item]  # last, so keys are checked before they name places
         elif isinstance(item, list | tuple):  # a tuple is a key
             waiting += [(part, (*place, index)) for index, part in enumerate(item)]
-        elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):
+        elif isinstance(item, str) and _IMPOSSIBLE.search(item):
             raise _impossible(path, place, f"holds a text with impossible characters ({item[:60]!r})")
         elif isinstance(item, int) and item.bit_length() >= MAX_INTEGER_BITS:
             digits = item.bit_length() * 3 // 10
@@ -112,11 +115,3 @@ def _refuse_impossible_values(path: Path, value: object) -> None:
 def _impossible(path: Path, place: tuple[object, ...], problem: str) -> DataError:
     where = ".".join(map(str, place))[:200]
     return DataError(path, f"{where}: {problem}" if where else problem, "mend it", code="bad-value")
-
-
-def _is_unicode(text: str) -> bool:
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True

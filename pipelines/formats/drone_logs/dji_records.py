@@ -160,14 +160,6 @@ class _Record:
             ahead_ns = ahead_ns + 500_000_000
         return since_ns + int(np.median(ahead_ns - ahead_ns[0])) + int(ahead_ns[0]), known
 
-    def angles(self, part: str) -> Float:
-        """Return yaw, pitch, roll [N, 3] in degrees; NaN for a gimbal that is 0 throughout."""
-        angles = np.stack([self.columns[f"{part}_{name}"] for name in ("yaw", "pitch", "roll")], axis=1)
-        if part == "gb" and not np.nan_to_num(angles).any():
-            return np.full_like(angles, np.nan)
-        angles[np.isnan(angles[:, 2]) & np.isfinite(angles[:, 0]), 2] = 0
-        return angles
-
     @property
     def rows(self) -> DjiRows:
         """The rows in the form that all files of DJI's share."""
@@ -178,8 +170,7 @@ class _Record:
             timed,
             {**self.columns, **placed},
             self.clock,
-            body=self.angles("drone"),
-            gimbal=self.angles("gb"),
+            zero_is_none=True,
             dropped=self.dropped,
         )
 

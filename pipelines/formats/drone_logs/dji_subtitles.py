@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.files import read_head
+from pipelines.formats.common.files import read_bytes, read_head
 from pipelines.formats.common.rows import longest_rising
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
@@ -35,7 +35,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, AttitudeTrack, Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import as_data_error, empty, plain_text
+from pipelines.session.storage import empty, plain_text
 
 # DJI's drones fly no higher than this above their take-off.
 _HIGHEST_M = 500
@@ -47,14 +47,22 @@ class DjiRows:
 
     t_ns: Int64  # [N]
     timed: Bool  # [N] True where the time is known
-    columns: Mapping[str, Float]  # [N] by name: latitude, longitude (deg), relative, absolute, altitude (m)
+    # [N] by name: latitude, longitude (deg), relative, absolute, altitude (m), drone_yaw, gb_yaw, ... (deg)
+    columns: Mapping[str, Float]
     clock: str  # as in `Telemetry`
-    body: Float  # [N, 3] yaw, pitch, roll (deg)
-    gimbal: Float  # [N, 3] the same of the camera
     names: tuple[str, str] = ("its body's angles", "its gimbal angles")
     rows: str = "rows"  # name of the rows where losses are counted
     repeats: bool = True  # a position is repeated until the next measurement
+    zero_is_none: bool = False  # angles of a gimbal that are 0 throughout
     dropped: Mapping[str, int] = field(default_factory=dict)
+
+    def angles(self, part: str) -> Float:
+        """Return yaw, pitch, roll [N, 3] in degrees of `drone` or `gb`; a missing roll is 0."""
+        yaw, pitch, roll = (self.columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll"))
+        roll = np.where(np.isnan(roll) & np.isfinite(yaw), 0.0, roll)
+        found = np.stack([yaw, pitch, roll], axis=1)
+        is_none = self.zero_is_none and part == "gb" and not np.nan_to_num(found).any()
+        return np.full_like(found, np.nan) if is_none else found
 
 
 def telemetry_of_rows(
@@ -82,8 +90,8 @@ def telemetry_of_rows(
                 f"{moved} of {len(values)} positions repeat the one before: taken between measurements"
             )
     body, gimbal = (
-        angles_track(name, found.t_ns[found.timed], angles[found.timed], dropped, rows=found.rows)
-        for name, angles in zip(found.names, (found.body, found.gimbal), strict=True)
+        angles_track(name, found.t_ns[found.timed], found.angles(part)[found.timed], dropped, rows=found.rows)
+        for name, part in zip(found.names, ("drone", "gb"), strict=True)
     )
     return Telemetry(
         position=track,
@@ -99,7 +107,7 @@ def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
     """Build the attitudes of the camera, whatever the rows say of positions."""
     dropped = dict(found.dropped)
     camera = angles_track(
-        found.names[1], found.t_ns[found.timed], found.gimbal[found.timed], dropped, rows=found.rows
+        found.names[1], found.t_ns[found.timed], found.angles("gb")[found.timed], dropped, rows=found.rows
     )
     if camera is None:
         problem = "holds no gimbal angles"
@@ -243,10 +251,7 @@ class Subtitles:
 
 def read_subtitles(path: Path) -> Subtitles:
     """Read all subtitles of a file; bytes that are not UTF-8 become a sign that no number contains."""
-    try:
-        text = plain_text(path.read_bytes())
-    except OSError as error:
-        raise as_data_error(error, path) from error
+    text = plain_text(read_bytes(path))
     subtitles = parse_subtitles(text)
     if not subtitles.texts:
         raise empty(path, "holds no subtitles" if text.strip() else "is empty")
@@ -350,8 +355,6 @@ def _rows(subtitles: Subtitles) -> DjiRows:
         timed,
         columns,
         "the drone's clock" if subtitles.has_clock.any() else "the video's start",
-        body=_angles(columns, "drone"),
-        gimbal=_angles(columns, "gb"),
         names=("F.PRY", "its gimbal angles"),
         rows="subtitles",
     )
@@ -390,14 +393,6 @@ def _fields(text: str) -> dict[str, float]:
     if "latitude" not in fields or "longitude" not in fields:  # the text was cut between the two
         fields.pop("latitude", None)
     return fields
-
-
-def _angles(columns: Mapping[str, Float], part: str) -> Float:
-    """Return yaw, pitch, roll [B, 3] in degrees; a missing roll is 0."""
-    yaw, pitch, roll = (columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll"))
-    return np.stack(
-        [yaw, pitch, np.where(np.isnan(roll), np.where(np.isnan(yaw), np.nan, 0.0), roll)], axis=1
-    )
 
 
 def _note_on_clock(subtitles: Subtitles) -> str:

@@ -299,8 +299,6 @@ class PictureTags(DroneLog):
             t_ns != 0,
             columns,
             "the drone's clock",
-            body=_angles(columns, "drone"),
-            gimbal=_angles(columns, "gb"),
             names=("flight angles", "gimbal angles"),
             rows="pictures",
             repeats=False,
@@ -318,10 +316,6 @@ def _columns(path: Path) -> tuple[Int64, bool, dict[str, Float]]:
     t_ns, shared = picture_times(tags)
     columns = {name: np.array([each.values.get(name, np.nan) for each in tags]) for name in NAMES}
     return t_ns, shared, columns | {"altitude": np.full(len(tags), np.nan)}
-
-
-def _angles(columns: Mapping[str, Float], part: str) -> Float:
-    return np.stack([columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll")], axis=1)
 
 
 PICTURE_TAGS = PictureTags()
