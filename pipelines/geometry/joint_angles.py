@@ -186,7 +186,9 @@ def _groups() -> list[_Group]:
             _Group(names("shoulder_plane", "shoulder_elevation"), (*_TRUNK, elbow), mirrored(_shoulder)),
             _Group(names("shoulder_rotation"), (*_TRUNK, elbow, wrist), mirrored(_shoulder_rotation)),
             _Group(names("elbow_flexion"), (shoulder, elbow, wrist), _elbow),
-            _Group(names("forearm_pronation"), (elbow, wrist), _never),
+            _Group(
+                names("forearm_pronation"), (elbow, wrist), lambda points: np.full_like(points[0, :1], np.nan)
+            ),
         ]
     return groups
 
@@ -296,23 +298,13 @@ def _elbow(points: Float) -> Float:
     return _bend(points[1] - points[0], points[2] - points[1])[None]
 
 
-def _never(points: Float) -> Float:
-    return np.full((1, points.shape[-1]), np.nan)
-
-
 def _dot(one: Float, other: Float) -> Float:
     product: Float = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
     return product
 
 
 def _cross(one: Float, other: Float) -> Float:
-    return np.stack(
-        [
-            one[1] * other[2] - one[2] * other[1],
-            one[2] * other[0] - one[0] * other[2],
-            one[0] * other[1] - one[1] * other[0],
-        ]
-    )
+    return np.cross(one, other, axis=0)
 
 
 def _unit(vector: Float) -> Float:
