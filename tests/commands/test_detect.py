@@ -26,7 +26,6 @@ from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import logged_actor
 from pipelines.session.records import Trajectory
-from pipelines.session.registries import need
 from pipelines.session.stages import StageRecord, locked
 from pipelines.session.storage import read_json
 from pipelines.session.tables import JOINT_ERRORS, figures_by_joint, motion_from, read_table, trajectory_from
@@ -93,38 +92,13 @@ def test_what_cannot_be_run_is_refused_in_one_line(tmp_path: Path) -> None:
     assert "takes nothing behind" in refused(
         "reconstruct", session, "--method", "robust", "--detector", "blazepose:x"
     )
+    line = refused("reconstruct", session, "--detector", spot_detector(tmp_path).replace("=cpu", "=quantum"))
+    assert "provider=quantum" in line
     text = tmp_path / "text.onnx"
     text.write_text("no model")
     assert "is no model" in refused(
         "reconstruct", session, "--method", "robust", "--detector", f"onnx:{text}"
     )
-
-
-def test_another_provider_detects_anew_and_one_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    session = write_spotted_flight(tmp_path, 5).with_suffix(".session")
-    succeeds("ingest", tmp_path / "flight.yaml")
-    detector = spot_detector(tmp_path).removesuffix(",provider=cpu")
-    reconstruct = ("reconstruct", session, "--detector")
-    line = refused(*reconstruct, f"{detector},provider=QuantumExecutionProvider")
-    assert "provider=quantum" in line
-    assert "cpu" in line
-    assert not (session / "detect").exists()
-    succeeds(*reconstruct, detector)
-    assert "unchanged" in succeeds(*reconstruct, f"{detector},provider=CPUExecutionProvider")
-    assert provider(session) == "cpu"
-    onnxruntime = need("onnxruntime", "onnx")
-    others = [name for name in onnxruntime.get_available_providers() if name != "CPUExecutionProvider"]
-    if not others:
-        pytest.skip("this ONNX Runtime has no other provider")
-    succeeds(*reconstruct, f"{detector},provider={others[0]}")
-    assert provider(session) == others[0].removesuffix("ExecutionProvider").lower()
-
-
-def provider(session: Path) -> str:
-    """Return the provider that the stage says ran the models."""
-    stage = read_json(session / "detect" / "stage.json")
-    stated = dict(option.split("=", 1) for option in stage["settings"]["detector"][len("onnx:") :].split(","))
-    return str(stated["provider"])
 
 
 def test_only_the_pictures_of_the_span_are_looked_at(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -51,18 +52,16 @@ def cameras_of(folder: Path) -> dict[str, Any]:
     return cameras
 
 
-def made_at(path: Path, t_ns: int) -> None:
-    """Copy a video with the time of its creation in its metadata."""
-    moved = path.with_name("moved.mp4")
-    with av.open(str(path)) as source, av.open(str(moved), "w") as target:
-        made = datetime.fromtimestamp(t_ns // 10**9, UTC)
-        target.metadata["creation_time"] = made.isoformat()
+def copied(video: Path, path: Path, *, made_ns: int | None = None, pictures: int = 1000) -> None:
+    """Copy the first pictures of a video, with the time of its creation in its metadata."""
+    with av.open(str(video)) as source, av.open(str(path), "w") as target:
+        if made_ns is not None:
+            target.metadata["creation_time"] = datetime.fromtimestamp(made_ns // 10**9, UTC).isoformat()
         stream = target.add_stream_from_template(source.streams.video[0])
-        for packet in source.demux(source.streams.video[0]):
+        for packet in islice(source.demux(source.streams.video[0]), pictures):
             if packet.dts is not None:
                 packet.stream = stream
                 target.mux(packet)
-    moved.replace(path)
 
 
 def write_topics(path: Path, names: list[str]) -> None:
@@ -126,8 +125,8 @@ def test_a_folder_without_a_camera_is_drafted_with_exit_status_1(tmp_path: Path)
 
 
 def test_videos_and_logs_of_one_flight_are_paired_by_motion(tmp_path: Path) -> None:
-    shutil.copyfile(SAMPLE / "drone1.mp4", tmp_path / "north.mp4")
-    shutil.copyfile(SAMPLE / "drone2.mp4", tmp_path / "lake.mp4")
+    copied(SAMPLE / "drone1.mp4", tmp_path / "north.mp4", pictures=180)
+    copied(SAMPLE / "drone2.mp4", tmp_path / "lake.mp4", pictures=180)
     shutil.copyfile(SAMPLE / "drone2.mcap", tmp_path / "rec_2023_A.mcap")
     write_dataflash(tmp_path / "00000042.bin", drone_of_sample("drone1"))
     cameras = cameras_of(tmp_path)
@@ -153,8 +152,9 @@ def test_videos_and_logs_of_different_hours_are_paired_by_time(tmp_path: Path) -
         write_ulog(
             tmp_path / f"log_{3 if later_ns else 8}.ulg", ulog_rows(drone_of_sample("drone1", later_ns))
         )
-        write_video(tmp_path / f"{name}.mp4", even_ticks(60))
-        made_at(tmp_path / f"{name}.mp4", int(first.t_ns[0]) + later_ns + 3_000_000_000)
+        film = write_video(tmp_path / "film.mp4", even_ticks(60))
+        copied(film, tmp_path / f"{name}.mp4", made_ns=int(first.t_ns[0]) + later_ns + 3_000_000_000)
+        film.unlink()
     cameras = cameras_of(tmp_path)
     assert cameras["a"]["pose"] == {"file": "log_8.ulg", "assumed": True}
     assert cameras["b"]["pose"] == {"file": "log_3.ulg", "assumed": True}

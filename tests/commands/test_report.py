@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from html import unescape
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from tests.synthetic.flights import write_flight
 
 
 @pytest.mark.slow
-def test_figures_of_a_session_and_of_a_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_of_a_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # One kind of file is enough here; tests/reporting/test_figures.py has them all.
     monkeypatch.setattr(chart, "_FILE_METADATA", {"svg": {"Date": None}})
     session, figures = tmp_path / "robust.session", tmp_path / "figures"
@@ -32,15 +31,6 @@ def test_figures_of_a_session_and_of_a_comparison(tmp_path: Path, monkeypatch: p
     (figures / "notes.txt").write_text("mine")
     assert "notes.txt" in refused("report", session, "--figures", figures)
     assert "is a session" in refused("report", session, "--figures", session)
-
-    other, both = tmp_path / "dlt.session", tmp_path / "both"
-    shutil.copytree(session, other)
-    succeeds("reconstruct", other, "--method", "dlt")
-    succeeds("report", session, other, "-o", tmp_path / "page.html", "--figures", both)
-    told = read_json(both / "figures.json")
-    keys = [each["figure"] for each in told["figures"]]
-    assert keys == ["compare-time", "compare-joints"]
-    assert list(told["sessions"]) == ["robust", "dlt"]
 
 
 SCENARIO = """

@@ -269,30 +269,6 @@ def test_an_interrupted_rendering_goes_on_where_it_was(
     assert len(brightness) == read_json(output / "simulation.json")["frames"]["drone1"]
 
 
-@pytest.mark.slow
-def test_a_planner_flies_around_what_the_ring_flies_into(tmp_path: Path) -> None:
-    """Put a wall across the ring, at the height of the drones: the planner avoids it, the ring does not."""
-    wall = "world: {walls: [{start: [6, 0.5], end: [16, 0.5], height_m: 6}], ground: {size_m: 40}}\ndrones:"
-    text = (
-        EXACT.replace("drones:", wall)
-        .replace("count: 3", "count: 2")
-        .replace("duration_s: 4", "duration_s: 8")
-    )
-    nearest = {}
-    for planner, turning in (("ring", ", yaw_rate_deg_per_s: -6"), ("adaptive", "")):
-        (tmp_path / planner).mkdir()
-        formation = f"count: 2\n  formation: {{planner: {planner}, yaw_deg: 30{turning}}}"
-        flight = simulated(tmp_path / planner, text.replace("count: 2", formation), "--no-video")
-        distances = []
-        for name in ("drone1", "drone2"):
-            x, y, z = np.loadtxt(flight.parent / "truth" / f"{name}.tum")[:, 1:4].T
-            beside = np.hypot(np.maximum(np.abs(x - 11) - 5, 0), np.maximum(np.abs(y - 0.5) - 0.15, 0))
-            distances.append(np.hypot(beside, np.maximum(z - 6, 0)).min())
-        nearest[planner] = min(distances)
-    assert nearest["ring"] < 0.3
-    assert nearest["adaptive"] > 0.5
-
-
 @pytest.mark.parametrize("name", ["cmu_10_01_soccer_kick"])
 def test_recorded_motion_is_flown_around(tmp_path: Path, name: str) -> None:
     recording = real_data(f"motion/{name}.bvh")

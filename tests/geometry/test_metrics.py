@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.metrics import (
-    RESAMPLES,
     STRETCH_S,
     bone_lengths,
     intervals,
@@ -311,11 +310,3 @@ def test_trials_pair_sums_with_weights() -> None:
     assert np.diff(found["x"]) == pytest.approx(NORMAL_95 * 2 / np.sqrt(400), rel=0.15)
     assert found["ratio"] == pytest.approx((3.0, 3.0))
     assert intervals({"x": (values[:1], ONE[:1])}, None) == {"x": None}
-
-
-def test_short_flights_are_cut_into_five_and_seeds_repeat() -> None:
-    assert stretch_samples(times_of(60)) == 12
-    values = np.random.default_rng(4).normal(size=SAMPLES)
-    first, again, other = (intervals({"x": (values, ONE)}, times_of(), seed=seed)["x"] for seed in (0, 0, 1))
-    assert first == again != other
-    assert RESAMPLES >= 1000

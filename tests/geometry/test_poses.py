@@ -287,13 +287,6 @@ def test_a_batch_is_its_members_and_nan_where_there_is_no_answer() -> None:
             np.testing.assert_allclose(batch.apply(source)[i, j], one.apply(source[i, j]), atol=1e-12)
 
 
-@pytest.mark.parametrize("origin", [0.0, 1000.0])
-@pytest.mark.parametrize("step", [0.0, 0.3])
-def test_points_on_a_line_or_a_spot_have_no_alignment(origin: float, step: float) -> None:
-    line = origin + np.arange(5.0)[:, None] * step * np.array([0.3, -0.7, 0.2])
-    assert np.isnan(align_each(line, line + 1, with_scale=True).rotation).all()
-
-
 # IOGP Guidance Note 7-2, method 9837: the topocentric origin of the worked example.
 NORTH_SEA = Place(55.0, 5.0, 200.0)
 

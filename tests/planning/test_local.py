@@ -1,4 +1,4 @@
-"""The local planner: exact gradients, its metric, obstacles it leaves and drones it keeps away from."""
+"""The local planner: exact gradients, and obstacles it leaves."""
 
 from dataclasses import replace
 
@@ -8,9 +8,9 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import DistanceField, distance_field
-from pipelines.planning.local import DronePlan, LocalPlanner
+from pipelines.planning.local import LocalPlanner
 from pipelines.session.records import Occupancy
-from tests.planning.worlds import bare_ground, mound
+from tests.planning.worlds import mound
 
 TUNING = PlannerTuning(eps_obs_m=1.5, soft_separation_margin_m=0.5)
 CONFIG = PlannerConfig(tuning=TUNING)
@@ -56,39 +56,6 @@ def test_the_gradient_is_the_derivative_of_the_cost(seed: int, speed_floor: floa
     assert np.abs(numeric - gradient).max() < 1e-4 * np.abs(gradient).max()
 
 
-def test_terms_of_a_steady_flight_in_closed_form() -> None:
-    """2 m/s straight on, 1.5 m beside the slots, 3 m from another drone, over flat ground at 2 m."""
-    planner = LocalPlanner(CONFIG)
-    t = 0.5 * np.arange(1, 21)
-    waypoints = np.stack([2 * t - 10, 0 * t, 0 * t + 2.0], axis=1)
-    total, terms, _ = planner.cost(
-        np.array([-10.0, 0, 2]),
-        np.array([2.0, 0, 0]),
-        waypoints,
-        slots=waypoints + np.array([0, 1.5, 0]),
-        actor=waypoints + np.array([0, 10.0, 0]),
-        others=(waypoints + np.array([0, 0, 3.0]))[None],
-        field=bare_ground(),
-    )
-    speed = np.sqrt(2.0**2 + CONFIG.tuning.speed_floor_mps**2)
-    # Ground's surface is at 0.5 m: M = 1.5 = eps_obs, where the hinge just ends.
-    expected = {"smooth": 2.0**2 / 2, "form": 1.5**2 / 2, "obs": 0.0, "occ": 0.0, "sep": 0.5**2 / 2}
-    assert terms == pytest.approx(expected, abs=1e-9)
-    lower = waypoints - [0, 0, 1.2]  # M = 0.3 for drone and sight line
-    _, terms, _ = planner.cost(
-        lower[0] - [1.0, 0, 0],
-        np.array([2.0, 0, 0]),
-        lower,
-        slots=lower,
-        actor=lower + np.array([0, 10.0, 0]),
-        others=NOBODY,
-        field=bare_ground(),
-    )
-    assert terms["obs"] == pytest.approx((0.3 - 1.5) ** 2 / 3 * speed * 10, rel=1e-5)
-    assert terms["occ"] == pytest.approx((0.3 - 0.5) ** 2 / 1 * 8.5 * speed * 10, rel=1e-5)
-    assert total == pytest.approx(2.0 + CONFIG.l_form * 1.125 + CONFIG.tuning.l_sep * 0.125)
-
-
 @pytest.mark.parametrize(("speed_floor", "gets_out"), [(1.0, True), (0.0, False)])
 def test_who_stands_inside_the_mound_gets_out_if_speed_has_a_floor(
     speed_floor: float, gets_out: bool
@@ -102,7 +69,3 @@ def test_who_stands_inside_the_mound_gets_out_if_speed_has_a_floor(
         0.0, inside, np.zeros(3), slots=slots, actor=slots - [0, 9, 2], others=[], field=field, previous=None
     )
     assert (field.sample(made.path[-1])[0] > 0) == gets_out
-
-
-def straight(start: Float, end: Float, start_s: float = 0.0) -> DronePlan:
-    return DronePlan(start_s, np.linspace(start, end, 21), (end - start) / 10.0, 0.5)

@@ -279,28 +279,6 @@ def test_traversal_finds_every_box_that_is_crossed(seed: int, share: float) -> N
             assert seen[k] == (longest == 0.0)
 
 
-@given(st.integers(0, 10_000), st.sampled_from([0.001, 0.02, 0.98]))
-def test_within_a_leap_all_is_alike(seed: int, share: float) -> None:
-    """Every voxel within the leap of any point of a voxel has its state; far off, leaps are long."""
-    field, occupied = random_field(seed, share)
-    bricks = field.sight.bricks
-    apart = np.transpose(bricks.reshape(*bricks.shape[:3], 4, 4, 4), (0, 3, 1, 4, 2, 5))
-    byte = apart.reshape([4 * n for n in bricks.shape[:3]])[:12, :10, :8]
-    assert np.array_equal(byte % 2 == 1, occupied)
-    places = np.argwhere(np.ones_like(occupied))
-    for at in places[np.random.default_rng(seed).choice(len(places), 20)]:
-        gap = np.maximum(np.abs(places - at) - 1, 0)  # between the boxes
-        other = occupied[tuple(places.T)] != occupied[tuple(at)]
-        leap = byte[tuple(at)] // 2
-        if not other.any():
-            assert leap == 127
-            continue
-        assert leap / 2 <= np.sqrt((gap[other] ** 2).sum(axis=1)).min()
-        # D of the voxel's centre, less a diagonal, to the half voxel below
-        centres = np.sqrt(((places[other] - at) ** 2).sum(axis=1)).min()
-        assert leap >= 2 * (centres - np.sqrt(3)) - 1.01
-
-
 def test_the_end_at_the_actor_is_left_out() -> None:
     occupied = np.zeros((40, 3, 3), dtype=np.float32)
     occupied[0:2] = 1  # the actor's own voxels, x < 1

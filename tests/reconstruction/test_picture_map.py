@@ -25,7 +25,6 @@ from pipelines.reconstruction.picture_map import (
     LaidMap,
     NoAttitudesError,
     PictureMap,
-    key_rows,
     lay_on_places,
     map_pictures,
     poses_of_pictures,
@@ -60,17 +59,6 @@ def mapped(places: Float, turned: Float) -> PictureMap:
 def errors_deg(laid: LaidMap, turned: Float) -> Float:
     """Return the rotation vectors [K, 3] from true attitudes to found ones, about the world's axes, deg."""
     return np.degrees(rotation_vector_from_quaternion(multiply(laid.quaternion_xyzw, conjugate(turned))))
-
-
-def test_key_pictures_are_a_fifth_to_half_a_second_apart() -> None:
-    for seconds in (3, 20, 120):
-        t_ns = np.arange(seconds * 30 + 1) * 10**9 // 30
-        rows = key_rows(t_ns)
-        steps_s = np.diff(t_ns[rows]) / 1e9
-        assert rows[0] == 0
-        assert rows[-1] == len(t_ns) - 1
-        assert steps_s.min() > 0.16
-        assert steps_s.max() < 0.54
 
 
 def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m: float) -> list[KeyFeatures]:

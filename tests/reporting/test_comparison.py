@@ -17,7 +17,6 @@ from pipelines.reporting.content import SessionContent, StudyContent
 from pipelines.reporting.session_comparison import (
     compare,
     draw_comparison,
-    labels_of,
     lead,
     render_comparison,
 )
@@ -176,15 +175,6 @@ def test_figures_come_with_their_numbers(content: SessionContent, page: str) -> 
     table = pd.read_csv(io.StringIO(written[1]))
     errors = table[table["panel"].str.startswith("MPJPE") & (table["series"] == "b")]["x"]
     assert errors.mean() == pytest.approx(2 * OFF_MM)
-
-
-def test_labels_are_as_long_as_they_must_be() -> None:
-    assert labels_of([("x", "monday"), ("x", "tuesday")]) == ["monday", "tuesday"]
-    assert labels_of([("x", "monday", "flight"), ("x", "tuesday", "flight")]) == [
-        "monday/flight",
-        "tuesday/flight",
-    ]
-    assert labels_of([("flight",), ("x", "flight")]) == ["flight", "x/flight"]
 
 
 GENERATOR = '<meta name="generator" content="mocap'

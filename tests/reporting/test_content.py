@@ -27,7 +27,6 @@ from pipelines.reporting.wording import (
     THIN,
     cell_text,
     joint_label,
-    moment,
     percent,
 )
 
@@ -234,8 +233,3 @@ def test_texts_of_cells_are_no_formulas(start: str) -> None:
     assert cell_text(f"a;{start}1") == f"a;'{start}1"
     assert cell_text(-1.5) == -1.5
     assert cell_text(None) is None
-
-
-def test_moment_tells_the_epoch_from_a_clock_of_its_own() -> None:
-    assert moment(1_700_000_000_123_000_000) == "2023-11-14 22:13:20.123 UTC"
-    assert moment(12_500_000_000).startswith(f"12.500{THIN}s ")

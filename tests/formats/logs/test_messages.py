@@ -189,18 +189,6 @@ def test_camera_info(version: str, stated: Any, model: str, distortion: tuple[fl
     )
 
 
-@pytest.mark.parametrize("binning", [2, 4])
-def test_a_calibration_that_is_binned_already_is_not_binned_again(binning: int) -> None:
-    """Use pictures of 516 x 386 px, as in astuff/avt_vimba_camera#82; the principal point tells."""
-    sizes = {"width": 516 * binning, "height": 386 * binning}
-    stated = sizes | {"binning_x": binning, "binning_y": binning}
-    binned = lens(camera_info("ros2", **stated, k=[299.5, 0, 254.1, 0, 300.1, 183.9, 0, 0, 1]))
-    whole = [binning * number for number in (299.5, 0, 254.1, 0, 300.1, 183.9, 0, 0)]
-    of_whole = lens(camera_info("ros2", **stated, k=[*whole, 1]))
-    assert binned == of_whole
-    assert (binned.width, binned.height, binned.fx, binned.cx, binned.cy) == (516, 386, 299.5, 254.1, 183.9)
-
-
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
 def test_foxglove_calibration(encoding: str) -> None:
     fields = {
