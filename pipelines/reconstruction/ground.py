@@ -110,6 +110,8 @@ _REPEATED = 0.5
 _LOSS = 2.0
 # Weights settle in fewer rounds than this.
 _ROUNDS = 8
+# Positions by satellites err by so many times the level that is assumed where nobody stated one.
+_GPS_LIKE = 4.0
 # The level of constant position errors settles in fewer rounds.
 _LEVEL_ROUNDS = 6
 # Fewer distinct patches of a pair of cameras agree by chance.
@@ -217,22 +219,27 @@ def bind_positions(
         for a, b in permutations(range(len(cameras)), 2)
         if len(views[a].points) and len(views[a].stills) and len(views[b].stills)
     ]
-    solution = _Solution(np.zeros(6 * len(cameras)), np.diag(prior**2))
     counts, used = np.zeros((len(pairs), 2), dtype=np.int64), np.zeros(len(pairs), dtype=np.bool_)
     most = min(_MOST_OF_PAIR, _MOST_PATCHES // max(len(pairs), 1))
     of_pair = np.array([np.sqrt(_PAIR_SIGMA_M**2 + bent[a] ** 2 + bent[b] ** 2) for a, b in pairs])
-    for share in _PASSES if pairs else ():
-        # Where nothing is known the search goes far, and few patches are found; they narrow the next search.
-        matches = _compare(views, pairs, solution, most // share)
-        if not len(matches.pair):
+    assumed = _assumed(cameras)
+    for wider in (1.0, _GPS_LIKE) if assumed.any() else (1.0,):
+        prior = np.where(assumed, wider * prior, prior)
+        solution = _Solution(np.zeros(6 * len(cameras)), np.diag(prior**2))
+        for share in _PASSES if pairs else ():
+            # Where nothing is known the search goes far, and few patches are found; they narrow the next one.
+            matches = _compare(views, pairs, solution, most // share)
+            if not len(matches.pair):
+                break
+            _, agree = _solve(matches, prior, of_pair)
+            both = (matches.pair, matches.pair[agree])
+            counts = np.stack([np.bincount(pair, minlength=len(pairs)) for pair in both], axis=1)
+            used = (counts[:, 1] >= _FEWEST_PATCHES / share) & (counts[:, 1] > _AGREE * counts[:, 0])
+            if not used.any():
+                break
+            solution, _ = _solve(_of_pairs(matches, used), prior, of_pair)
+        if used.any():
             break
-        _, agree = _solve(matches, prior, of_pair)
-        both = (matches.pair, matches.pair[agree])
-        counts = np.stack([np.bincount(pair, minlength=len(pairs)) for pair in both], axis=1)
-        used = (counts[:, 1] >= _FEWEST_PATCHES) & (counts[:, 1] > _AGREE * counts[:, 0])
-        if not used.any():
-            break
-        solution, _ = _solve(_of_pairs(matches, used), prior, of_pair)
     if used.any():
         found = _of_pairs(matches, used)
         for _ in range(_LEVEL_ROUNDS):
@@ -608,6 +615,12 @@ def _prior_sigma(cameras: Sequence[Camera]) -> Float:
     return np.maximum(np.repeat(sigma.ravel(), 3), EXACT)
 
 
+def _assumed(cameras: Sequence[Camera]) -> Bool:
+    """Mark the prior standard deviations [6 C] that nobody stated: those of constant position errors."""
+    assumed = np.repeat([c.errors is not None and c.errors.assumed for c in cameras], 3)
+    return np.append(assumed, np.zeros_like(assumed))
+
+
 def _bent(camera: Camera) -> float:
     """Compute the standard deviation (m) of what slow errors leave in the places of a camera's points.
 
@@ -748,9 +761,7 @@ def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Sol
     Returns:
         Standard deviations [6 C], no larger than before.
     """
-    numbers = 3 * len(cameras)
-    assumed = np.repeat([c.errors is not None and c.errors.assumed for c in cameras], 3)
-    assumed = np.append(assumed, np.zeros(numbers, dtype=np.bool_))
+    assumed = _assumed(cameras)
     if not assumed.any():
         return prior
     determined = float(np.sum(1 - np.diagonal(solution.covariance)[assumed] / prior[assumed] ** 2))
