@@ -17,14 +17,6 @@ CLOCK = 9
 REMEMBERED = 1.5
 """Memory (correlation length) of keypoint errors above which it is taken into account."""
 
-LOOSE_MOTION = 3.0
-"""Factor on standard deviations of accelerations where cameras and clocks are estimated.
-
-A gait repeats: its accelerations are no white noise, and most are slow. Against keypoints that count less,
-the learned prior would make swings smaller, and cameras and clocks would make up for it: clocks were 7 ms
-off, and cameras of a flight of two minutes turned by 0.7 deg.
-"""
-
 
 @dataclass(frozen=True)
 class Pictures:
@@ -119,7 +111,11 @@ class Knowledge:
     size_m: float  # mean bone length of the body for which these two hold; they scale with it
     pixel_scale: float  # factor on the stated standard deviations of image points
     memory: float = 1.0
-    """Number of neighbouring image points of a joint in a camera that count as one independent point."""
+    """Number of neighbouring image points of a joint in a camera that count as one independent point.
+
+    Accelerations count less by the same number, because a gait repeats and they are no white noise. If they
+    outweighed the image points, swings would become smaller, and cameras would make up for it.
+    """
 
 
 @dataclass(frozen=True)
@@ -290,7 +286,6 @@ class System:
     def __post_init__(self) -> None:
         """Derive the values that every linearisation needs."""
         problem, known, seen = self.problem, self.knowledge, self.problem.pictures
-        loose = LOOSE_MOTION if known.memory > REMEMBERED else 1.0
         of_time, fraction = problem.intervals()
         white_row, white_precision = _loosened(problem, *_white_errors(problem, known.poses))
         kept, variance = _ties(self.layout)
@@ -310,7 +305,7 @@ class System:
                 white_row=white_row,
             ),
             "white_precision": white_precision,
-            "inverse_acceleration": np.linalg.inv(loose**2 * known.acceleration),
+            "inverse_acceleration": np.linalg.inv(known.memory * known.acceleration),
             "of_time": np.append(of_time, max(len(problem.knot_t_s) - 2, 0)),
             "usual_step_s": float(np.median(np.diff(problem.t_s))),
             "tie_kept": kept,
