@@ -87,11 +87,12 @@ def associate(
 ) -> Association:
     """Choose the detections of the people who were logged, then of others, most seen first.
 
-    Detections of different cameras and times are grouped into bodies (see `bodies`). Where several are seen,
-    this is done again without the pose errors that all bodies of a picture share. Of the bodies each logged
-    person is the one that fits their log best, so that the sum over all of them is greatest; nobody stands in
-    for a logged person whom no camera sees. Others are those seen in most camera-frames by two cameras or
-    more, ties by confidence. The order of detections within a camera and frame does not matter.
+    Detections of different cameras and times are grouped into bodies (see `bodies`); where several are seen,
+    again without the pose errors that all bodies of a picture share. Of the bodies each logged person is the
+    one that fits their log best, so that the sum over all of them is greatest; nobody stands in for a logged
+    person whom no camera sees. Others are those seen in most camera-frames by two cameras or more, ties by
+    confidence. The order of detections within a camera and frame does not matter. A lone view is kept where
+    its picture continues the person's last one.
 
     Args:
         time_s: [T] seconds, strictly increasing.
@@ -104,14 +105,11 @@ def associate(
             clock error times the actor's angular speed.
         actors: [T, A, 3] m, the people who were logged, person 0 first, NaN where unknown. If no log is
             near anybody, none is used.
-        actor_sigma_m: standard deviation of the logs on each axis; the largest one if several people are
-            logged, whose noise is estimated from bodies that three cameras place.
+        actor_sigma_m: standard deviation of the logs on each axis; of several people the largest one, and
+            their noise is estimated from bodies that three cameras place.
         people: number of people to choose; None: those who were logged and whoever else is a person as far
             as two cameras or more can tell (`why_no_person`), at least one.
         scene: the surroundings, by which bodies that are nobody are left out.
-
-    Returns:
-        The choice and its counts. A lone view is kept where its picture continues the person's last one.
     """
     if confidence.shape[2] == 0:  # no detections at all: make room for one absent person
         xy = np.full((*xy.shape[:2], 1, *xy.shape[3:]), np.nan)
@@ -464,19 +462,11 @@ _REMAINING_NOISE_SHARE = 0.7
 def without_common_errors(time_s: Float, views: SightLines, seen: Bodies) -> SightLines:
     """Turn the cameras so that the views of the person seen most agree.
 
-    A camera that is turned or shifted moves everybody in its picture by about the same. The person who is
-    seen most is surely one body, so what their views have in common shows these errors. Without them, two
-    people who stand near each other are further apart than the views of one person. Only the part on which
-    views can disagree is found. Cameras that all err alike show the person elsewhere, and still agree.
-
-    Args:
-        time_s: [T] s, increasing.
-        views: all detections.
-        seen: their tracks.
-
-    Returns:
-        The views with other rotations and less noise; as they were where the errors do not last, and without
-        anybody whom two cameras see.
+    A camera that is turned or shifted moves everybody in its picture by about the same. Without these errors,
+    which the views of one body show, two people who stand near each other are further apart than the views of
+    one person. Only the part on which views can disagree is found: cameras that all err alike still agree.
+    Views with other rotations and less noise are returned; the same ones where the errors do not last, and
+    without anybody whom two cameras see.
     """
     person = _most_seen(seen)
     if person is None:
@@ -617,18 +607,10 @@ def why_no_person(
 ) -> str:
     """Say why a body that two cameras see is no further person to reconstruct; empty if it is one.
 
-    Args:
-        body: the detections in question.
-        people: those already taken for people.
-        time_s: [T] s, increasing.
-        views: all detections.
-        scene: the surroundings, if known.
-
-    Returns:
-        "short": seen by two cameras for less than a second, or never together with anybody, as the pieces
-        of one lost person; "same": alongside a person, and never with them in one picture; "ground": too
-        high or too low; "size": not of a person's extent; "misfit": the views do not fit each other;
-        "bystander": beyond the ring of the cameras, and never in all of their pictures.
+    "short": seen by two cameras for less than a second, or never together with anybody, as the pieces of one
+    lost person; "same": alongside a person already taken, and never with them in one picture; "ground": too
+    high or too low; "size": not of a person's extent; "misfit": the views do not fit each other; "bystander":
+    beyond the ring of the cameras, and never in all of their pictures.
     """
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     there: Bool = np.isfinite(body.middle[:, 0])

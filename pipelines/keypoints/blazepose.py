@@ -99,15 +99,10 @@ _REGION_MARGIN = 1.25
 def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *, beyond: str) -> Picture:
     """Sample the RGB values [height, width, 3] of a BGR picture at a crop's pixels, bilinear.
 
-    OpenCV 4 rounds positions to 1/32 px when it warps, as does the one inside MediaPipe; OpenCV 5 does
-    not, which moves landmarks by 0.6 px (median) where the crop is coarser than the picture. Fixed-point
-    maps are rounded the same way in both.
-
-    Args:
-        picture: [H, W, 3] BGR.
-        picture_from_crop: [2, 3] from the crop's pixels to the picture's; (0, 0) is the centre of the first.
-        size: width and height of the crop.
-        beyond: values around the picture: `edge` repeats its border, `black` is 0.
+    `picture_from_crop` [2, 3] is between pixels, (0, 0) the centre of the first; `beyond` the border is
+    repeated (`edge`) or 0 (`black`). OpenCV 4 and the one inside MediaPipe round positions to 1/32 px when
+    they warp; OpenCV 5 does not, which moves landmarks by 0.6 px (median) where the crop is coarser than the
+    picture. Fixed-point maps are rounded the same way in both.
     """
     import cv2
 
@@ -127,9 +122,8 @@ class PersonFinder:
         self._anchors = _anchors()
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
-        """Find people in a picture [H, W, 3] BGR, best first.
+        """Find people who are tall in a picture [H, W, 3] BGR, best first.
 
-        Only people who are tall in the picture are found, because the network sees 224 x 224 pixels.
         PoseDetectionCpu: the picture is fitted into 224 x 224, black around; boxes relative to anchors
         (TensorsToDetectionsCalculator) that overlap are merged (NonMaxSuppressionCalculator, WEIGHTED).
         """
@@ -169,9 +163,8 @@ class BlazePose(PersonFinder):
     def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
         """Locate the joints of the person in each region of a picture [H, W, 3] BGR.
 
-        Every joint has a position. Its confidence is the smaller of two values: the peak of its heatmap
-        within 4 cells, and the network's probability that the joint lies inside the crop. It is 0 outside
-        the crop.
+        Every joint has a position. Its confidence is the smaller one of the peak of its heatmap within 4
+        cells and the network's probability that it lies inside the crop; it is 0 outside the crop.
         """
         return [self._locate(picture, region) for region in regions]
 

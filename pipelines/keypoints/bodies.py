@@ -3,17 +3,15 @@
 In each camera detections are joined to pieces of at most a second, where the next picture leaves no doubt.
 Evidence between two pieces is the sum over time of
 
-    3^2 - s^2
+3^2 - s^2
 
 where s is the distance, in standard deviations, at which the viewing rays of their common joints pass each
 other. It is bounded: a gross error weighs, and does not decide. A piece that goes on in its own picture is
 evidence, too, and so is the log of a person, as one more camera. Pieces of one camera at one time are two
 bodies. The bodies are the partition whose sum of evidence is greatest: pieces are joined, best first, then
 moved and exchanged while the sum rises. So two people who stood behind each other for one camera are told
-apart by all that was seen before and after it.
-
-The noise of keypoints is learned: if the rays of the bodies pass each other farther than their standard
-deviations say, these are enlarged, and the bodies made again.
+apart by all that was seen before and after it. If the rays of the bodies pass each other farther than their
+standard deviations say, these are enlarged, and the bodies made again.
 """
 
 from typing import NamedTuple
@@ -100,14 +98,10 @@ class Bodies(NamedTuple):
 def find_bodies(
     time_s: Float, views: SightLines, logs: Float | None = None, before: Bodies | None = None
 ) -> Bodies:
-    """Find the bodies of all detections.
+    """Find the bodies of all detections at increasing times [T].
 
-    Args:
-        time_s: [T] s, increasing.
-        views: the detections.
-        logs: [T, A, 4] m, the places of logged people and their standard deviation on each axis, NaN where
-            unknown.
-        before: the bodies of the same detections as they were found with other errors of the poses.
+    `logs` [T, A, 4] m are the places of logged people and their standard deviation on each axis, NaN where
+    unknown; `before` the bodies of the same detections as they were found with other errors of the poses.
     """
     # From left to right in each picture, so that the order of the input does not matter.
     given = np.where((views.confidence > 0)[..., None], views.xy, np.nan)
@@ -537,15 +531,9 @@ def rays_of(xy: Float, rotation: Float) -> Float:
 
 
 def meeting_points(rays: Float, origin: Float, weight: Float) -> tuple[Float, Float]:
-    """Find the points nearest to viewing rays by least squares.
+    """Find the points [..., 3] nearest to rays [..., C, 3] by least squares, and the normal matrices.
 
-    Args:
-        rays: [..., C, 3] unit; not used where the weight is 0.
-        origin: [..., C, 3] m.
-        weight: [..., C].
-
-    Returns:
-        Points [..., 3], NaN for fewer than two rays and for parallel ones, and the normal matrices.
+    Points are NaN for fewer than two rays and for parallel ones; a unit ray counts where its weight is not 0.
     """
     rays, origin = (np.where(weight[..., None] > 0, of, 0.0) for of in (rays, origin))
     across = weight[..., None, None] * (np.eye(3) - rays[..., :, None] * rays[..., None, :])

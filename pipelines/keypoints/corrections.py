@@ -1,21 +1,18 @@
 """Corrections of keypoints: confidences become probabilities, and left and right are exchanged back.
 
-Exchanges are found from the motion of joints in one camera, and from the views of others.
+In one camera an exchange makes two joints jump by their distance, and jump back when it ends. Each picture
+has two hypotheses, exchanged or not, weighed by how well every joint continues its motion: Viterbi's shortest
+path over the errors of prediction at constant velocity. First for the arms and for the legs, then for the
+face, which goes with them where both were exchanged, then for hands, feet and each other pair of joints. The
+majority decides which side is right: an exchange in most pictures cannot be detected here.
 
-In one camera an exchange makes two joints jump by their distance, and jump back when it ends. Each
-picture has two hypotheses, exchanged or not, weighed by how well every joint continues its motion: Viterbi's
-shortest path over the errors of prediction at constant velocity. First for the arms and for the legs, then
-for the face, which goes with them where both were exchanged, then for hands, feet and each other pair of
-joints. Which of the two sides is right is decided by the majority: an exchange in most pictures cannot be
-detected here.
+Exchanges often begin or end where legs cross in the picture. Nothing jumps there, and detectors place joints
+that hide each other badly. Crossings are therefore no evidence: a jump at one end is needed, and the nearer
+one of the crossings before and behind it is the other end.
 
-Exchanges often begin or end where legs cross in the picture. Nothing jumps there, and detectors place
-joints that hide each other badly for some pictures. Crossings are therefore no evidence: a jump at one end
-is needed, and the nearer one of the crossings before and behind it is the other end.
-
-Across cameras, at one time: if the viewing rays of a limb's joints do not meet, exchanging left and right
-in one or two cameras can make them meet. All sets of one or two cameras are tried, first for each limb, then
-for each pair of joints.
+Across cameras, at one time: if the viewing rays of a limb's joints do not meet, exchanging left and right in
+one or two cameras can make them meet. All sets of one or two cameras are tried, first for each limb, then for
+each pair of joints.
 """
 
 import csv
@@ -70,19 +67,11 @@ _CROSSING_SHARE = 0.3
 def undo_swaps(
     t_s: Float, xy: Float, confidence: Float, joints: Sequence[str]
 ) -> tuple[Float, Float, dict[str, int]]:
-    """Undo exchanges of left and right.
+    """Undo exchanges of left and right of one person's joints [T, J, 2] in one camera, NaN where not seen.
 
-    Args:
-        t_s: [T] seconds, strictly increasing.
-        xy: [T, J, 2] one person's joints in one camera, in pixels or normalised; NaN where not seen.
-        confidence: [T, J].
-        joints: the names of the J joints.
-
-    Returns:
-        Positions and confidences with the exchanges undone, and the number of pictures in which there was
-        one: of the `arms`, the `legs`, the `face` apart from those, of a `hand` or a `foot`, and of a single
-        pair as `knee`.
-        Values without an exchange are the same to the last bit.
+    Positions are pixels or normalised. Returns positions, confidences [T, J] and the number of pictures with
+    an exchange: of the `arms`, the `legs`, the `face` apart from those, of a `hand` or a `foot`, and of a
+    single pair as `knee`. Values without an exchange are the same to the last bit.
     """
     xy, confidence = xy.copy(), confidence.copy()
     pairs = {name.removeprefix("left_"): pair for name, pair in mirrored_pairs(joints).items()}
@@ -110,12 +99,8 @@ def undo_swaps(
 def undo_swaps_of_tracks(found: Detections, frame_t_ns: Int64) -> tuple[Detections, dict[str, int]]:
     """Undo exchanges for all people that one camera followed; detections with one number are one person.
 
-    Args:
-        found: detections of one camera, sorted by frame.
-        frame_t_ns: [F] time of each of its frames.
-
-    Returns:
-        The detections, and the pictures with an exchange by limb, summed over the people.
+    Detections are sorted by frame, `frame_t_ns` [F] are the times of these. Returned are the detections, and
+    the pictures with an exchange by limb, summed over the people.
     """
     xy, confidence = found.xy.copy(), found.confidence.copy()
     total: Counter[str] = Counter()
@@ -167,11 +152,8 @@ def exchange(values: Float, where: Bool, pairs: Sequence[Pair]) -> None:
 def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: float) -> Bool:
     """Find the pictures [T] in which pairs of joints, all together, are more likely exchanged than not.
 
-    Args:
-        t_s: [T] seconds.
-        xy: [T, J, 2].
-        pairs: columns of left and right joints.
-        size: size of the body, in the unit of `xy`.
+    `pairs` are columns of left and right joints of `xy` [T, J, 2], `size` that of the body in the unit of
+    `xy`.
     """
     left, right = (xy[:, [pair[side] for pair in pairs]] for side in (0, 1))
     seen = (np.isfinite(left) & np.isfinite(right)).all(-1).sum(-1)
@@ -316,18 +298,12 @@ def swaps_across_views(
     """Find the side of each joint where the rays of the other cameras meet.
 
     If an exchange in exactly half of the cameras (one of two) mends it, the right half is unknown: the limb
-    is dropped from all cameras at that time.
+    is dropped from all cameras at that time. `xy` [T, J, C, 2] are one person's joints, undistorted and
+    normalised, NaN not seen; poses are world_from_camera [T, C, 3] m, NaN without one, and [T, C, 3, 3];
+    `sigma` [T, C] rad is the deviation of a ray on each axis, of pixels and poses together.
 
-    Args:
-        xy: [T, J, C, 2] one person's joints, undistorted normalised picture coordinates, NaN not seen.
-        position: [T, C, 3] m, world_from_camera, NaN without a pose.
-        rotation: [T, C, 3, 3] world_from_camera.
-        sigma: [T, C] rad, standard deviation of a ray on each axis: of pixels and poses together.
-        joints: the names of the J joints.
-
-    Returns:
-        The joint [T, J, C] whose view belongs to each joint: its own number, its mirror's if the two are
-        exchanged, -1 if it is dropped; and the numbers of joint views `undone` and `dropped`.
+    Returns the joint [T, J, C] whose view belongs to each joint: its own number, its mirror's if the two are
+    exchanged, -1 if it is dropped; and the numbers of joint views `undone` and `dropped`.
     """
     xy, sides = xy.copy(), np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2]))
     counts: Counter[str] = Counter()
@@ -429,15 +405,11 @@ ANY_JOINT = "*"
 class Calibration:
     """Maps from confidence to probability, by group of joints.
 
-    Each was fitted on keypoints whose error is known (rendered flights): the monotone map that is nearest to
-    the outcomes in least squares (isotonic regression; Zadrozny and Elkan, "Transforming Classifier Scores
-    into Accurate Multiclass Probability Estimates", 2002). `tools/detector_errors.py` measures it.
-
-    Attributes:
-        origin: the command and the data that it was measured with.
-        good: definition of a good joint, in words.
-        knots: for each group [K, 3] confidence (rising), probability (not falling) and count of keypoints.
-            A group is a part of joints' names (`wrist`); `*` is for those of no group.
+    Each was fitted on keypoints whose error is known (rendered flights) by isotonic regression (Zadrozny and
+    Elkan, "Transforming Classifier Scores into Accurate Multiclass Probability Estimates", 2002);
+    `tools/detector_errors.py` measures it, `origin` is its command and data, `good` the definition of a good
+    joint. `knots` are, for each group, [K, 3] confidence (rising), probability (not falling) and count of
+    keypoints. A group is a part of joints' names (`wrist`); `*` is for those of no group.
     """
 
     origin: str

@@ -157,19 +157,10 @@ def _short_name(provider: str) -> str:
 class OnnxNetwork:
     """Loaded model with one picture as input. Not thread-safe: each thread needs its own.
 
-    Args:
-        order: of its channels.
-        norm: mean and standard deviation of red, green and blue: its input is (value 0..255 - mean) / std.
-        provider: the short name of the execution provider that runs it.
-        size: width and height of its input, where the graph leaves them open.
-        threads: on the CPU.
-
-    Attributes:
-        size: width and height of its input.
-        shapes: shapes of the outputs, by name, for one picture.
-
-    DataError: not a model that ONNX Runtime can run, or not one of a single picture as input; no such
-    provider.
+    `order` is that of its channels, `norm` mean and standard deviation of red, green and blue: its input is
+    (value 0..255 - mean) / std. `size` are width and height of its input, to be given where the graph leaves
+    them open, `shapes` those of the outputs, by name, for one picture. DataError: not a model that ONNX
+    Runtime can run, or not one of a single picture as input; no such provider.
     """
 
     def __init__(
@@ -295,12 +286,9 @@ _FLOOR = 1e-10
 
 @dataclass(frozen=True)
 class PoseDecoder:
-    """Decoder of one network's outputs.
+    """Decoder of one network's outputs: x and y scores, or heatmaps, of `count` joints.
 
-    Attributes:
-        outputs: names of the x and y scores, or of the heatmaps.
-        count: number of joints.
-        per_px: [2] bins or cells for each pixel of the input, in x and y.
+    `per_px` [2] are bins or cells for each pixel of the input, in x and y.
     """
 
     outputs: tuple[str, ...]
@@ -434,9 +422,8 @@ class OnnxPeople:
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
         """Find people in a picture [H, W, 3] BGR, best first.
 
-        The picture is fitted into the top left of the network's input. The network counts from the edge of
-        the first pixel, the regions returned from its centre. DataError: the network's outputs are not [1, N,
-        5] boxes with scores, with or without labels.
+        The picture is fitted into the top left of the network's input, which counts from the edge of the
+        first pixel. DataError: the outputs are not [1, N, 5] boxes with scores, with or without labels.
         """
         width, height = self._network.size
         scale = max(picture.shape[1] / width, picture.shape[0] / height)
@@ -479,10 +466,7 @@ def _upright_crop(region: Region, size: tuple[int, int]) -> Float:
 class OnnxPose:
     """Loaded networks. Not thread-safe.
 
-    Args:
-        decoder: reads its outputs.
-        joints: names of its first joints; further joints are left out.
-        people: finder of people; None if only the log gives their place.
+    Joints beyond `joints` are left out. Without a finder of people only the log gives their place.
     """
 
     def __init__(
@@ -506,9 +490,8 @@ class OnnxPose:
     def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
         """Locate the joints of the person in each region, in one run if the graph's batch is open.
 
-        `presence` is the share of joints with a score of at least 0.3. The next region is that of the body
-        with these joints, which reach from the ankles to the eyes only, unless the skeleton has heels and
-        the head's top.
+        `presence` is the share of joints with a score of at least 0.3. The next region is that of these
+        joints, from the ankles to the eyes only unless the skeleton has heels and the head's top.
         """
         if not regions:
             return []

@@ -51,20 +51,12 @@ def project_actor(
 ) -> Hint | None:
     """Project the actor's logged position into a camera's picture.
 
-    The height is that of a body across the line of sight, for any tilt of the camera; sizes of regions are
-    measured in it. Lengths are converted to pixels at the actor's place, so they include distortion
-    and the stretch away from the axis.
-
-    Args:
-        position_world: [3] m, the point of the actor that the log follows (hip or near it).
-        world_from_camera: position [3] m and quaternion [4] xyzw of the camera at that time.
-        sigma_m: one sigma per axis of the actor's position relative to the camera's, both errors together.
-        sigma_rad: one sigma per axis of the camera's rotation.
-        height_m: height of the actor.
-
-    Returns:
-        The hint; None where a number is missing (NaN), the actor is behind the camera or beyond the
-        model's valid radius, or outside the picture by more than the margin.
+    `position_world` [3] m is hip or near it, `world_from_camera` the camera's pose at that time, `sigma_m`
+    one sigma per axis of both positions together, `sigma_rad` that of the camera's rotation. The height in
+    the picture is that of a body across the line of sight, for any tilt; sizes of regions are measured in it.
+    Pixels are taken at the actor's place, with distortion and the stretch away from the axis. None where a
+    number is missing (NaN), the actor is behind the camera or beyond the model's valid radius, or outside the
+    picture by more than the margin.
     """
     actor = transform(invert(*world_from_camera), position_world)
     # project() expects depth to be comparable, and NaN fails every comparison.
@@ -103,11 +95,9 @@ def actor_hints(
     between: Interpolation,
     t_ns: Int64,
 ) -> list[Hint | None]:
-    """Predict the logged actor's hips in a camera's pictures; None where the log or the pose is missing.
+    """Predict the logged actor's hips in a camera's pictures [T]; None where the log or the pose is missing.
 
-    Args:
-        between: rules for interpolating between the logged poses.
-        t_ns: [T] times of the pictures.
+    `between` are the rules for interpolating between the logged poses.
     """
     position, quaternion = poses_at(trajectory, t_ns, between, static=entry.poses.static)
     sigma = hint_sigma(name, entry, trajectory, t_ns)
@@ -123,16 +113,11 @@ def actor_hints(
 
 
 def hint_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, t_ns: Int64) -> Float:
-    """Compute the uncertainty of the logged actor as seen from a camera's logged pose.
+    """Return the uncertainty [T, 2] of the logged actor as seen from a camera's logged pose, per axis.
 
-    Args:
-        entry: the camera's entry in session.json; its pose noise is used, else the log's covariances.
-        t_ns: [T] times of the pictures.
-
-    Returns:
-        Standard deviation per axis [T, 2]. First column: position of the actor relative to the camera (m),
-        with the errors of both. Second column: rotation of the camera (rad). Each row uses the noise of
-        the last logged pose before the picture.
+    First the position relative to the camera (m), with the errors of both, then the camera's rotation (rad),
+    each of the last logged pose before the picture: by the noise of the camera's entry in session.json, else
+    by the log's covariances.
     """
     stated = stated_noise(name, entry, trajectory).sigma
     if stated is None:
@@ -223,14 +208,10 @@ def squares_about(
 
 
 def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile]) -> list[FoundPerson]:
-    """Find people in parts of a picture, each person once.
+    """Find people in parts of a picture [H, W, 3] BGR, each person once.
 
-    Args:
-        picture: [H, W, 3] BGR.
-
-    Returns:
-        Whole bodies before those that a tile's border cuts, then by score; of several at one place (in
-        overlapping tiles) the first of these.
+    Whole bodies come before those that a tile's border cuts, then by score; of several at one place (in
+    overlapping tiles) the first is taken.
     """
     found = [
         FoundPerson(_moved(region, part), score, _is_cut(region, part, picture))

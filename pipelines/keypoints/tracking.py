@@ -106,14 +106,13 @@ class _PictureTrack:
 
 
 class PeopleTracker:
-    """Tracker of people through the pictures of one camera.
+    """Tracker of people through the pictures of one camera; results depend only on pictures and hints so far.
 
     A person is searched at the place of the joints in the last picture. The person detector runs around
-    people just lost, and around the hint of each logged person who is not seen. It runs on tiles of the whole
-    picture if nobody is followed, and every `search_every` pictures (10 with `only_one`, else 5). Each such
-    search takes the next few tiles, so that the cost of a large picture spreads over several. The first
-    picture is searched until a person is found. A logged person who is not seen is searched in each of the
-    first 30 pictures, then in every fifth.
+    people just lost, and around the hint of each logged person who is not seen: in each of the first 30
+    pictures, then in every fifth. It runs on tiles of the whole picture if nobody is followed, and every
+    `search_every` pictures (10 with `only_one`, else 5). Each such search takes the next few tiles, so that
+    the cost of a large picture spreads over several. The first picture is searched until a person is found.
 
     With `only_one`, one person is wanted: fewer tiles are searched while somebody is followed. With a hint,
     those who cannot be the actor, by place or size, are not followed while somebody can, and the whole
@@ -123,14 +122,11 @@ class PeopleTracker:
     Things that are no people are dropped by their scores, where the networks say which (`TellsPeople`). The
     only track is kept, and so is the only one that can be a logged person.
 
-    Results depend only on the pictures and hints so far.
-
-    Attributes:
-        counts: frames; searched (frames in which the person detector ran); found (new numbers); lost
-            (not seen for more than 5 frames); found again (at the place where they were lost, under the
-            old number); merged (two numbers on one body, the older stays); beyond the most (people
-            found but not followed, in each search again); no people (tracks dropped by their scores);
-            not the actor (tracks dropped by place or size); without anybody (frames).
+    `counts` are frames; searched (frames in which the person detector ran); found (new numbers); lost (not
+    seen for more than 5 frames); found again (where they were lost, under the old number); merged (two
+    numbers on one body, the older stays); beyond the most (people found but not followed, in each search
+    again); no people (tracks dropped by their scores); not the actor (by place or size); without anybody
+    (frames).
     """
 
     def __init__(
@@ -154,14 +150,9 @@ class PeopleTracker:
         self._unseen_for: Counter[int] = Counter()  # pictures with a hint, since the logged person was seen
 
     def step(self, picture: Picture, *, hints: Sequence[Hint | None] = ()) -> list[TrackedPerson]:
-        """Find the people in the next picture.
+        """Find the people in the next picture [H, W, 3] BGR, sorted by number.
 
-        Args:
-            picture: [H, W, 3] BGR.
-            hints: place of each logged person, None if unknown, in the same order for all pictures.
-
-        Returns:
-            The people seen in this picture, sorted by number.
+        Hints are the places of logged people, None if unknown, in the same order for all pictures.
         """
         logged = {k: hint for k, hint in enumerate(hints) if hint is not None}
         self._most_people = max(self._most_people, len(hints))
@@ -491,12 +482,9 @@ def _detector_side(region: Region) -> float:
 
 
 class FollowedPeople:
-    """Tracker of the people in the pictures of one camera, built on `PeopleTracker`.
+    """Tracker of the people in one camera's pictures, with the J joints wanted; see `PeopleTracker`.
 
-    Args:
-        networks: the detector, loaded.
-        joints: the J whose keypoints are wanted; those that the detector does not have are never found.
-        only_one: nobody but one person is in the pictures.
+    Joints that the detector does not have are never found.
     """
 
     def __init__(self, networks: KeypointNetworks, joints: Sequence[str], *, only_one: bool) -> None:
@@ -504,14 +492,9 @@ class FollowedPeople:
         self._column = [networks.joints.index(name) if name in networks.joints else None for name in joints]
 
     def step(self, picture: Picture, *, hints: Sequence[Hint | None]) -> tuple[Float, Float]:
-        """Return the keypoints of the K people in the next picture, the highest presence first.
+        """Return the K people in the next picture: positions [K, J, 2] px and confidences [K, J].
 
-        Args:
-            picture: [H, W, 3] BGR.
-            hints: place of each logged person, None if unknown.
-
-        Returns:
-            Positions [K, J, 2] px, NaN for joints not found, and confidences [K, J], 0 for joints not found.
+        The highest presence comes first. Joints not found are NaN, their confidence 0.
         """
         people = [seen.person for seen in self._tracker.step(picture, hints=hints)]
         xy, confidence = (

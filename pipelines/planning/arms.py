@@ -67,11 +67,9 @@ class FormationPlanner(Protocol):
     """Planner that chooses the slots of the cameras during one flight."""
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
-        """Plan anew.
+        """Plan anew from the commanded slots [n, 3] (yaw rad, tilt rad, range m).
 
-        Args:
-            commanded: [n, 3] the slots that are commanded now (yaw rad, tilt rad, range m).
-            actor: forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
+        `actor` is the forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
         """
 
 

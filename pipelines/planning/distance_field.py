@@ -253,8 +253,7 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
     """Compute the distance field of a voxel map: from 0.5 on occupied, NaN unknown.
 
     M = d_free - res/2 outside and -(d_occ - res/2) inside, with the exact Euclidean distances between voxel
-    centres (scipy): the surface lies on the faces between free and occupied voxels. Without the half voxel
-    it would jump by two voxels there. Where a map has no obstacle at all, it is 1 km everywhere.
+    centres (scipy): the surface lies on the faces between voxels. Without obstacles it is 1 km everywhere.
     """
     with np.errstate(invalid="ignore"):
         occupied = occupancy.probability >= OCCUPIED

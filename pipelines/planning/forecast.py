@@ -25,8 +25,7 @@ class ActorFilter:
     """Position and velocity of the actor from the measurements so far, and nothing later.
 
     x = [p, v] per axis, F = [[1, dt], [0, 1]], Q = q [[dt^3/3, dt^2/2], [dt^2/2, dt]] (white noise
-    acceleration of spectral density q, m^2/s^3), measurements with `sigma_m` per axis; one 2x2 covariance
-    serves all axes.
+    acceleration of spectral density q, m^2/s^3); one 2x2 covariance serves all axes.
     """
 
     def __init__(self, *, q: float, sigma_m: float) -> None:

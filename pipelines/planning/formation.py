@@ -96,9 +96,8 @@ class FormationPath:
     def at(self, t_s: Float) -> Float:
         """Return commanded slots [T, n, 3] at times [T]; constant before the first knot and after the last.
 
-        From knot to knot slots move at the full rate and then wait. An even approach would never arrive,
-        because plans are replaced many times before the next knot; cells beyond the neighbour would stay out
-        of reach.
+        Slots move at the full rate and then wait for the next knot: plans are replaced many times before it,
+        so that an even approach would never leave the cell.
         """
         slots = np.empty((len(t_s), *self.slots.shape[1:]))
         _commanded(self.knot_s, self.slots, self.rates, t_s, slots)
@@ -432,10 +431,10 @@ def best_teams(
     """Find states of a team that are worth flying: [K, n, T], the cheapest first.
 
     The cost is the sum of the slots' prices [T, S], of turning from the commanded slots [n, 3], and of the
-    logarithm of the predicted error of the free shares [T, S]. It is descended, drone by drone until none
-    can be improved alone: from the plan before [n, T], from the cheapest formation of equal spacing, from
-    the cheapest one with the error left out (at the tilt and range that are asked for), and from nothing:
-    the drone with the dearest slots chooses first. The cheapest formation is a result, too.
+    logarithm of the predicted error of the free shares [T, S]. It is descended, drone by drone, from the plan
+    before [n, T], from the cheapest formation of equal spacing (a result, too), from the cheapest one with
+    the error left out (at the tilt and range that are asked for), and from nothing: the drone with the
+    dearest slots chooses first.
     """
     formation = _cheapest_formation(price, free, views, w, commanded)
     plain = _cheapest_formation(price, free, views, TeamWeights(0.0, w.prior, w.apart_m), commanded)
@@ -526,8 +525,7 @@ def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, floa
     """Find the cheapest way through a finite cost map [T, S]: [T] indices of states, and the sum of costs.
 
     `start` [3] is commanded now, anywhere between the states. The first step reaches the states that the
-    rates allow, or else the nearest state. Ties are broken in favour of the same state, or else the nearest
-    one.
+    rates allow, or else the nearest. Ties go to the same state, or else the nearest one.
     """
     return _search(cost, grid, start)
 

@@ -329,9 +329,9 @@ def least_distances(
 ) -> tuple[float, float, float]:
     """Compute the least distances of a motion to obstacles and drones, and of its plan to people, or inf.
 
-    The motion `states` [K + 1, 4, 3] is at rest from row `stopped` on; `others` [M, K + 1, 3] are the other
-    drones; `ahead` [A, 4, 3] is the motion along the plan without the stop. People [P, A or more, 3] may
-    walk on as forecast, or stop where they are.
+    The motion `states` [K + 1, 4, 3] rests from row `stopped` on; `others` [M, K + 1, 3] are other drones;
+    `ahead` [A, 4, 3] follows the plan without the stop. People [P, A or more, 3] may walk on as forecast, or
+    stop.
     """
     drones_m = people_m = math.inf
     for k in range(states.shape[0]):

@@ -183,9 +183,8 @@ def roll_out(
 ) -> int:
     """Follow a plan for some periods and then brake to a stop; return the row of the stop.
 
-    The plan is `path` [N + 1, 3] m, its first velocity and step; `after_s` is the time from its start to the
-    drone's state `states[0]`. The others of `states` [K + 1, 4, 3] are written; all after the stop are like
-    it.
+    The plan is `path` [N + 1, 3] m, its first velocity and step. `states[0]` is the drone's, `after_s` after
+    the plan's start; the others of `states` [K + 1, 4, 3] are written, at rest after the stop.
     """
     x, v, a, wanted, scratch = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     braking = min(BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)
@@ -540,9 +539,8 @@ class LocalPlanner:
     ) -> DronePlan:
         """Plan from the drone's place and velocity [3].
 
-        `slots` and `actor` [N, 3] are the wanted places of the drone and the forecast at each waypoint's
-        time, `others` the latest plans of the other drones, and `previous` this drone's plan before, the
-        initial guess; without one it is the slots.
+        `slots` and `actor` [N, 3] are the wanted places and the forecast at each waypoint's time, `others`
+        the latest plans of other drones, `previous` the initial guess: without one it is the slots.
         """
         config = self._config
         times = t_s + config.tuning.waypoint_s * np.arange(1, config.tuning.waypoints + 1, dtype=np.float64)

@@ -91,9 +91,8 @@ class Replay:
 class Pilot:
     """One arm in flight. Call `measure` at each measurement and `replan` at the tracking rate.
 
-    Central planning, local planning and tracking have the rates of the configuration, counted from the first
-    call. Drones plan one after the other, each with the latest plans of the others. ValueError: an impossible
-    number of drones.
+    The configuration's rates count from the first call. Drones plan one after the other, each with the latest
+    plans of the others. ValueError: an impossible number of drones.
     """
 
     def __init__(
@@ -132,13 +131,9 @@ class Pilot:
         self._filter.measure(t_s, position, person)
 
     def replan(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
-        """Replan if a plan is due.
+        """Replan if a plan is due at `t_s`, from the latest measurement of at least one.
 
-        Args:
-            t_s: now; at or after the latest measurement. There must be at least one.
-            position: [N, 3] metres, world, of the drones.
-            velocity: [N, 3] m/s.
-            field: the distance field of the obstacles that are known now.
+        `position` [N, 3] m and `velocity` [N, 3] m/s are the drones'; `field` has the obstacles known now.
         """
         config = self._config
         if t_s >= self._next_central_s - DUE_ROUNDING_S:
@@ -243,16 +238,11 @@ def replay(
 ) -> Replay:
     """Fly an arm against a log.
 
-    The drones start in their slots, at rest, and fly what `guard.Guard` admits. Several people are one actor
-    for most arms, their weighted middle; `group` decides whom each drone films.
-
-    Args:
-        actor: [A, 3] metres, world, the middle of the hips; or [A, P, 3] of several people. Who is NaN was
-            not measured then. The replay lasts while everybody is measured.
-        fields: the maps by the time from which they hold; before the first one nothing is known.
-        weights: of the people.
-
-    ValueError: times that do not ascend, fewer than two measurements, an impossible number of drones.
+    The drones start in their slots, at rest, and fly what `guard.Guard` admits. `actor` [A, 3] m, world, is
+    the middle of the hips, or [A, P, 3] of several people: one actor for most arms, in their weighted middle;
+    `group` decides whom each drone films. NaN was not measured; the replay lasts while everybody is. `fields`
+    are the maps by the time from which they hold; before the first nothing is known. ValueError: times that
+    do not ascend, fewer than two measurements, an impossible number of drones.
     """
     people = actor if actor.ndim == 3 else actor[:, None]
     measured_then = np.isfinite(people.sum(axis=2))  # [A, P]
@@ -511,14 +501,10 @@ class Detect(Protocol):
         focal_px: float,
         rng: np.random.Generator,
     ) -> tuple[Float, Float]:
-        """Return keypoints [T, J, 2] px (NaN: missed) and confidences [T, J].
+        """Return keypoints [T, J, 2] px (NaN: missed) and confidences [T, J] of exact pixels.
 
-        Args:
-            pixels: [T, J, 2] exact, NaN outside the picture.
-            free: [T, J] True where nothing hides the joint.
-            camera: [T, 3] m, world.
-            target: [T, 3] m, world, the person's middle.
-            rng: draws as many numbers for any visibility.
+        `free` [T, J] is where nothing hides the joint, `camera` and `target` (the person's middle) are [T, 3]
+        m, world. As many random numbers are drawn for any visibility.
         """
 
 

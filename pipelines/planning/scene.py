@@ -128,9 +128,8 @@ def load_flight(
 ) -> LoggedFlight:
     """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
-    `reconstructed` is the record of stage `reconstruct`, `pose_noise` replaces the errors stated in the
-    session. DataError: the actor's position is unknown, or not while the cameras flew; an unknown noise
-    model.
+    `reconstructed` is the record of that stage, `pose_noise` replaces the session's. DataError: the actor is
+    unknown, or not known while the cameras flew; an unknown noise model.
     """
     warnings: list[str] = []
     skeleton, skeleton_source = _skeleton(folder, description, reconstructed)

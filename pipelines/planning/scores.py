@@ -131,9 +131,8 @@ def sights(
 ) -> Bool:
     """Test [P, N, T] which cameras [N, T, 3] see which people [P, T, 3] (the middle of the hips).
 
-    The person is in the level field of view of the axis' yaw [N, T], and neither the map of each moment nor
-    anybody else stands between. A single person is in the picture of every camera, so that only the map
-    counts.
+    The person is in the level field of view of the axis' yaw [N, T], and neither the map nor anybody else
+    stands between. A single person is in every picture, so that only the map counts.
     """
     seen = []
     for p, person in enumerate(people):
@@ -168,13 +167,12 @@ def score(
 ) -> Scores:
     """Compute the figures of one flight, JSON-able: degrees and metres by name, None where nothing counts.
 
-    `position` [N, T, 3] m are the cameras at `t_s` [T], `actor` [T, 3] or [N, T, 3] whom they film; all
-    finite. `people` are [P, T, 3] if there are several: shares and errors are means over them, distances are
-    those to the nearest. `seen` is [P, N, T], by default the free lines of sight to the actor.
-    `limit_violations` counts episodes of each drone (of each pair for separation). `path_m` and `energy_kj`
-    are means over drones, `blind_s` is the time in which fewer than two of them see the actor.
-    `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
-    determine it.
+    `position` [N, T, 3] m are the cameras, `actor` [T, 3] or [N, T, 3] whom they film; all finite. `people`
+    are [P, T, 3] if there are several: shares and errors are means over them, distances are those to the
+    nearest. `seen` is [P, N, T], by default the free lines of sight to the actor. `limit_violations` counts
+    episodes of each drone (of each pair for separation). `path_m` and `energy_kj` are means over drones,
+    `blind_s` is the time in which fewer than two of them see the actor, `predicted_error_m` sqrt(tr S) of the
+    ray model while two free views or more determine it.
     """
     slots = slot_of(position - actor)
     tilt_deg = np.degrees(slots[..., TILT])
@@ -230,11 +228,11 @@ def coverage(
 ) -> Float:
     """Compute how densely one camera sees the faces of people, [..., A, 7] 1/m^2: six sides and the lid.
 
-    Each face counts with c = |d look| (-d n) / |d|^4 where d is from the camera [..., 3] to the face's
-    centre and n its normal: pixels per area, times the cosine of the view (Hughes et al., "Multi-Robot
-    Planning for Filming Groups of Moving Actors Leveraging Submodularity and Pixel Density", CDC 2024).
-    Faces that look away have 0, and so have people [..., A, 3] (centres of the sides) out of the level field
-    of view. Nobody hides anybody. Yaws are from east, the axis [...] is level, people have theirs [..., A].
+    Each face counts with c = |d look| (-d n) / |d|^4 where d is from the camera [..., 3] to the face's centre
+    and n its normal: pixels per area, times the cosine of the view (Hughes et al., "Multi-Robot Planning for
+    Filming Groups of Moving Actors Leveraging Submodularity and Pixel Density", CDC 2024). Faces that look
+    away have 0, and so have people [..., A, 3] (centres of the sides) out of the level field of view. Nobody
+    hides anybody. Yaws, of the level axis [...] and of people [..., A], are from east.
     """
     normal, centre = _faces(people, heading_rad)
     look = np.stack([np.cos(looks_rad), np.sin(looks_rad), np.zeros_like(looks_rad)], axis=-1)
@@ -275,8 +273,8 @@ def propulsion_w(level_mps: Float, climb_mps: Float) -> Float:
     """Compute the propulsion power (W) of a small drone of 20 N in still air.
 
     P = P0 (1 + 3 V^2/U^2) + Pi (sqrt(1 + V^4/(4 v0^4)) - V^2/(2 v0^2))^(1/2) + d rho s A V^3/2 at the level
-    speed V (Zeng, Xu & Zhang 2019), and the weight times the speed of climbing; descending saves nothing.
-    It compares arms: another drone needs another energy.
+    speed V (Zeng, Xu & Zhang 2019), and the weight times the speed of climbing. It compares arms: another
+    drone needs another energy.
     """
     square = level_mps**2
     blade = BLADE_POWER_W * (1.0 + 3.0 * square / TIP_SPEED_MPS**2)

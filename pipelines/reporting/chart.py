@@ -1,9 +1,9 @@
 """Figures: panels of marks, drawn in the page's style as inline SVG and as files for a publication.
 
 A `Figure` is data. Its drawing, its description in words and its numbers as CSV all follow from its marks.
-The SVG takes its colours and fonts from the page: each colour of the palette is replaced by a CSS variable,
-so that one drawing serves light and dark mode and paper, and text stays text. The same figure gives the same
-bytes, and its ids carry a prefix of their own, so that the figures of one page do not clash.
+Each colour of the SVG is a CSS variable of the page, so that one drawing serves light and dark mode and
+paper, and text stays text. The same figure gives the same bytes, and its ids carry a prefix of their own, so
+that the figures of one page do not clash.
 """
 
 from __future__ import annotations

@@ -275,9 +275,9 @@ def watched_bones(motion: MeasuredMotion) -> list[Bone]:
 def standing_heights(motion: MeasuredMotion) -> Float:
     """Return the height [T, P] on which each person stands, m.
 
-    It is the median over two seconds of the lowest measured joint, so that no single joint lifts a body.
-    Where nothing was measured, it is that of the last time before, else of the first after. Whoever was never
-    measured stands as high as the others do in the median; without anybody it is 0.
+    It is the median over two seconds of the lowest measured joint; where nothing was measured, that of the
+    last time before, else of the first after. Whoever was never measured stands as high as the others'
+    median; without anybody it is 0.
     """
     import pandas as pd
 

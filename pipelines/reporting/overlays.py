@@ -1,9 +1,9 @@
 """The skeleton reprojected into the pictures, beside the keypoints that were found there.
 
-A few moments are shown, spread over the flight. The worst is always among them: that of the largest error
-where truth is known, else the one with the largest disagreement of the views. Each camera shows its own frame
-nearest to the moment, with the skeleton and the logged pose interpolated to the time of that frame.
-`views_of` does the same for any stretch of a camera's frames.
+A few moments are shown, spread over the flight, always with the worst: that of the largest error where truth
+is known, else of the largest disagreement of the views. Each camera shows its frame nearest to the moment,
+with the skeleton and the logged pose interpolated to that frame's time. `views_of` does the same for any
+stretch of a camera's frames.
 """
 
 from __future__ import annotations
@@ -179,9 +179,9 @@ def choose_moments(motion: MeasuredMotion, error_mm: Float | None = None) -> tup
     """Choose rows of the motion to show, in order, and the worst of them.
 
     Each of `MOMENTS` equal stretches gives the time with the most joints, nearest its middle, and the worst
-    one itself. Where truth is known (`error_mm` [T, P, J]), the worst is the time of the largest error of a
-    measured joint: views may agree on legs that were swapped. Else it has the largest median reprojection
-    error among the times with at least half of the most joints, just before and after as well.
+    one itself: that of the largest error of a measured joint where truth is known (`error_mm` [T, P, J]),
+    since views may agree on swapped legs, else that of the largest median reprojection error among the times
+    with at least half of the most joints, just before and after as well.
     """
     count = motion.measured.sum(axis=(1, 2))
     around = np.concatenate([count[:1], count, count[-1:]])

@@ -1,9 +1,8 @@
 """Pictures with the skeleton in them: frames of videos, cut-outs for the page, and strips for the viewer.
 
-A square is cut out around the people, so that a distance of a few pixels can be seen. The page's panels have
-a small map in their corner that shows where in the picture the square lies. The viewer has small pictures of
-every camera, cut out the same way, with the joints in them. Their number follows from a budget of bytes, and
-their times are spread evenly over the flight.
+A square is cut out around the people, so that a distance of a few pixels can be seen; a small map in the
+corner of the page's panels shows where it lies. The viewer's small pictures of every camera are cut out the
+same way. Their number follows from a budget of bytes, and their times are spread evenly over the flight.
 """
 
 from __future__ import annotations
@@ -109,8 +108,8 @@ def draw_frame(
     Bones and joints are coloured by the side of the body; NaN is not drawn. Thin ellipses are the 95 %
     regions of the joints, by their own uncertainty alone. Rings are keypoints that were found, crosses those
     of joints that were rejected (red) or not reconstructed (grey), small dots those of other people. With
-    `residuals` a thin line leads from each keypoint to its joint. Caption and labels are ASCII; they are left
-    out where there is no room for them.
+    `residuals` a thin line leads from each keypoint to its joint. ASCII caption and labels are left out where
+    there is no room for them.
     """
     drawn = picture.copy()
     height, width = drawn.shape[:2]

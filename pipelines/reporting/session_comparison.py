@@ -1,9 +1,9 @@
 """Comparison of sessions: measures of each, and the differences from the first.
 
 Every measure is a mean over values [T, P, J] at the skeleton's times. Where two sessions hold the same motion
-at the same times, they are compared value by value, and the interval is that of the mean difference.
-Otherwise their means are compared, and the stretches of the two flights are resampled independently. In both
-cases the intervals are those of `geometry.metrics`, and are valid for these flights only.
+at the same times, the interval is that of the mean difference, value by value. Otherwise means are compared,
+and the stretches of the two flights resampled independently. The intervals are those of `geometry.metrics`,
+and are valid for these flights only.
 """
 
 from collections.abc import Mapping, Sequence

@@ -72,9 +72,9 @@ def make_scene(
 ) -> ViewerScene | None:
     """Pack a session for the viewer; None where there is nothing to be seen.
 
-    Every camera's pose (tables.POSES) is interpolated to the times of the skeleton, never across a gap as
-    the session defines it. Without a measured skeleton the cameras alone are shown. The cameras of simulated
-    arms are packed beside those of the session, with the map around them, and pictures where there are any.
+    Every camera's pose (tables.POSES) is interpolated to the skeleton's times, never across a gap as the
+    session defines it. Without a skeleton the cameras alone are shown. Cameras of simulated arms are packed
+    beside them, with the map around them, and pictures where there are any.
     """
     motion = summary.motion if summary.motion is not None and summary.motion.measured.any() else None
     cameras = [camera for camera in summary.cameras if camera.name in poses]

@@ -141,8 +141,7 @@ def cell_text(value: object) -> object:
     """Return a CSV's cell such that no spreadsheet takes its text for a formula; numbers stay as they are.
 
     OWASP, "CSV Injection": a single quote before =, +, -, @, tab, carriage return, line feed and the
-    full-width forms of the first four. It stands also where a cell begins for spreadsheets that separate by
-    semicolons or tabs, and after line breaks.
+    full-width forms of the first four, also after semicolons, tabs and line breaks, where cells may begin.
     """
     return _FORMULA.sub("'", value) if isinstance(value, str) else value
 

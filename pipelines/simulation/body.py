@@ -410,12 +410,7 @@ class PosablePerson:
     keypoint_moment: Float  # [17, M, 3] m, at rest
 
     def surface(self, root: Float, rotation: Float) -> TriangleSurface:
-        """Return the person's surface in one pose.
-
-        Args:
-            root: [3] m, the pelvis's joint in the world.
-            rotation: [22, 4] as in `BodyMotion`.
-        """
+        """Return the surface with the pelvis's joint at `root` [3] m; `rotation` [22, 4]: `BodyMotion`."""
         return TriangleSurface(
             self.skin.moved(*self.skinning.transforms(root, rotation)), self.faces, self.colour
         )

@@ -96,16 +96,10 @@ def read_errors(path: Path) -> ErrorTable:
 
 
 def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:
-    """Compute the exact pixels of joints; nothing hides anything.
+    """Compute the pixels [T, J, 2] of joints [T, J, 3] m, NaN behind the camera and outside the picture.
 
-    Args:
-        joints: [T, J, 3] metres, world.
-        position: [T, 3] metres, world_from_camera; or [T, J, 3] of each joint (or [T, 1, 3]).
-        quaternion_xyzw: [T, 4] unit, or as many as positions.
-
-    Returns:
-        [T, J, 2] px; NaN behind the camera and outside the picture, whose corner pixels have their
-        centres at (0, 0) and (width - 1, height - 1).
+    World_from_camera is [T, 3] and [T, 4], or one of each joint ([T, J or 1, 3]). Nothing hides anything. The
+    corner pixels have their centres at (0, 0) and (width - 1, height - 1).
     """
     if position.ndim == 2:
         position, quaternion_xyzw = position[:, None], quaternion_xyzw[:, None]
@@ -116,17 +110,10 @@ def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intr
 
 
 def view_of(camera: Float, target: Float, *, height_m: float, focal_px: float) -> tuple[Float, Float]:
-    """Compute a camera's tilt down at a person [T] in degrees, and the person's apparent height [T] px.
+    """Compute a camera's tilt down at a person's middle [T] in degrees, and the apparent height [T] px.
 
-    Args:
-        camera: [T, 3] m.
-        target: [T, 3] m, the person's middle, not where the camera is.
-        height_m: the person's, standing.
-        focal_px: the camera's focal length.
-
-    Returns:
-        The elevation of the camera above the target, and f H/d: the height as seen from the side, for any
-        tilt. Measured errors are shares of this height.
+    The height is f H/d, that of the standing person as seen from the side, for any tilt. Measured errors are
+    shares of it. The camera is never at the person's middle.
     """
     away = camera - target
     distance = np.linalg.norm(away, axis=-1)
@@ -144,29 +131,18 @@ def detect_keypoints(
     joints: tuple[str, ...],
     table: ErrorTable | None = None,
 ) -> tuple[Float, Float]:
-    """Simulate the detected keypoints of one person in one camera, frame by frame.
+    """Simulate the keypoints [T, J, 2] px of one person, NaN where missed, and confidences [T, J], then 0.
 
     Errors have the measured median length and no preferred direction; from frame to frame they follow a
     first-order autoregression (`KEPT_PER_FRAME`). Misses and outliers come one by one, more of them the
     steeper the camera looks. Hidden joints are mostly missed (`HIDDEN_MISSED_SHARE`, in every scenario), else
     found with large errors. Swapped limbs (elbow to hand, knee to foot) stay so for `SWAP_FRAMES`. The mean
     confidence of visible joints is the measured one; a joint's own falls with the rank of its error among
-    errors of its kind, and outliers lose up to `_OUTLIER_DOUBT` more, so that some of them look good.
+    errors of its kind, and outliers lose up to `_OUTLIER_DOUBT` more, so that some of them look good. With
+    `errors.scale` 0 all found keypoints are exact.
 
-    With `errors.scale` 0 there are neither outliers nor swaps: all found keypoints are exact.
-
-    Args:
-        pixels: [T, J, 2] exact pixels; NaN for joints outside the picture, which are never found.
-        visible: [T, J] True where nothing hides the joint.
-        tilt_deg: [T] elevation of the camera above the person.
-        apparent_height_px: [T] (`view_of`).
-        errors: the scenario's; its shares hold for visible joints.
-        rng: draws as many numbers for visible joints as for others.
-        table: measured errors; by default those of `errors.detector`.
-
-    Returns:
-        [T, J, 2] px, NaN for missed joints, and confidences [T, J] above 0 and at most 1; 0 for missed
-        joints.
+    The exact pixels are NaN for joints outside the picture; `visible` [T, J] is False where something hides
+    one, and takes no part in the random numbers. `table` is that of `errors.detector` by default.
     """
     table = read_errors(errors_of(errors.detector)) if table is None else table
     median_share, measured_missed, mean_confidence = table.at(tilt_deg, joints)

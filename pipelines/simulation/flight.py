@@ -121,10 +121,7 @@ class Set:
 
 
 def build_set(scenario: Scenario, *, bvh: Mapping[str, SkeletalMotion] | None = None) -> Set:
-    """Build a scenario's world and let its actors move there.
-
-    Args:
-        bvh: recorded motions by the name of the actor whose scenario names one.
+    """Build a scenario's world and let its actors move there; `bvh` has recorded motions by actor.
 
     DataError: the world cannot be built, or a motion is not that of a person.
     """
@@ -145,15 +142,10 @@ def fly_scenario(
     bvh: Mapping[str, SkeletalMotion] | None = None,
     planner: Callable[[World], Planner] | None = None,
 ) -> SimulatedFlight:
-    """Let the actors move, the drones fly, and the recorders run.
+    """Let the actors move, the drones fly, and the recorders run; `bvh` has recorded motions by actor.
 
-    Args:
-        bvh: recorded motions by the name of the actor whose scenario names one.
-        planner: makes a planner for a world; without one drones fly on a ring about where the first actor
-            truly is, whatever stands in the way.
-
-    DataError: the world cannot be built, a motion is not that of a person, or the flight is over before a
-    drone takes its first picture.
+    Without a maker of planners, drones fly on a ring about where the first actor truly is, whatever stands in
+    the way. DataError: as `build_set`, or the flight is over before a drone takes its first picture.
     """
     set_up = build_set(scenario, bvh=bvh)
     world, followed = set_up.world, set_up.people[0]
@@ -184,13 +176,10 @@ def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
 def visible_joints(
     flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
 ) -> tuple[Float, Bool]:
-    """Project a person's joints into a drone's pictures, and test if they are seen there.
+    """Project a person's joints into pictures: [F, J, 2] px, NaN outside, and [F, J] whether seen.
 
-    A rolling shutter takes each joint when it reads the row in which the joint is.
-
-    Returns:
-        [F, J, 2] exact px, NaN outside the picture; [F, J] whether a joint is in the picture and neither the
-        world nor anybody else stands before it. The person's own body hides nothing here.
+    Pixels are exact. A rolling shutter takes each joint when it reads its row. Joints are hidden by the world
+    and by anybody else, not by the person's own body.
     """
     truth, joints = drone.at_frames, person.joints[flight.moments_of(drone)]
     t_ns = truth.t_ns[:, None]

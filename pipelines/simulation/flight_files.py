@@ -1,8 +1,8 @@
 """Files of a simulated flight, in the formats that a real one has: manifest, log messages, keypoints, truth.
 
-Numbers are written with enough digits that reading them back costs less than 0.01 mm at 10 m. Messages are
-those of ROS 2, their fields plain numbers by name; a stamp is nanoseconds since the epoch, and fields that
-are zero may be left out. Axes are the world's, east-north-up.
+Numbers are written such that reading them back costs less than 0.01 mm at 10 m. Messages are those of ROS 2,
+their fields plain numbers by name; a stamp is nanoseconds since the epoch, and fields that are zero may be
+left out. Axes are the world's, east-north-up.
 """
 
 from __future__ import annotations
@@ -193,12 +193,10 @@ _UNKNOWN_CLOCK_SIGMA_S = 0.3
 
 
 def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = False) -> str:
-    """Write the manifest, which ties the files together.
+    """Write the manifest, which ties the files together: videos, or keypoints in their place.
 
-    Args:
-        video: True for videos; False for keypoints in their place.
-        true_poses: take the true poses for logged ones. Otherwise the manifest states only what a user would
-            know; the truth is only under `truth`.
+    With `true_poses` the true poses are the logged ones. Otherwise it states only what a user would know; the
+    truth is only under `truth`.
     """
     scenario = flight.scenario
     lines = [

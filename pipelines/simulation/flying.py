@@ -1,11 +1,9 @@
 """Camera poses of a ring as formulas; a flight model of masses, leaning bodies and gimbals; its recorders.
 
-A drone is a mass that a cascade of two loops steers, as autopilots do: the distance to its slot commands a
-velocity, the error in velocity commands an acceleration, and the attitude follows with a delay. There is no
-wind. Only speed and acceleration saturate. The attitude follows from the motion: a multirotor leans so that
-its thrust makes the acceleration; its nose turns to the actor. The camera hangs in a gimbal.
-
-Everything is integrated in equal steps of at most `STEP_S` between the requested moments.
+A drone is a mass that two loops steer, as autopilots do: the distance to its slot commands a velocity, the
+error in velocity an acceleration. Only these saturate; there is no wind. The attitude follows late: a
+multirotor leans so that its thrust makes the acceleration, and its nose turns to the actor. The camera hangs
+in a gimbal. Equal steps of at most `STEP_S` between the requested moments integrate all.
 """
 
 from __future__ import annotations
@@ -54,24 +52,15 @@ def orbit(
     yaw_rate_deg_per_s: float = 4.0,
     variation: float = 0.0,
 ) -> tuple[Float, Float]:
-    """Compute the poses of a formation on a ring around a moving target; every camera looks at it.
+    """Compute the poses of cameras on a ring around a target [T, 3] m; every camera looks at it.
 
-    The slots of Ho et al., "3D Human Reconstruction in the Wild with Collaborative Aerial Cameras":
-    yaw_i = yaw + i 2 pi/n (pi/2 for two cameras, which must not face each other), position =
-    target + range (cos yaw cos tilt, sin yaw cos tilt, sin tilt).
+    The slots of Ho et al., "3D Human Reconstruction in the Wild with Collaborative Aerial Cameras": yaw_i =
+    yaw + i 2 pi/n (pi/2 for two cameras, which must not face each other), position = target + range (cos yaw
+    cos tilt, sin yaw cos tilt, sin tilt). Yaw is that of the first camera at time 0, counterclockwise from
+    east. At `variation` 1 each camera strays by 10 degrees of yaw, 1 m of range and 3 degrees of tilt, by
+    sines of its own periods.
 
-    Args:
-        t_s: [T] seconds.
-        target: [T, 3] metres, world: a smooth point of the actor at those times.
-        cameras: number of cameras, at least 1.
-        tilt_deg: elevation of the cameras above the target, below 90.
-        yaw_deg: yaw of the first camera at time 0, counterclockwise from east.
-        yaw_rate_deg_per_s: angular speed of the ring.
-        variation: deviation of each camera from its slot, by sines of its own periods: 10 degrees of
-            yaw, 1 m of range and 3 degrees of tilt at 1.
-
-    Returns:
-        Positions [N, T, 3] and unit quaternions [N, T, 4] (xyzw), world_from_camera, upright pictures.
+    Returns positions [N, T, 3] and world_from_camera [N, T, 4] (xyzw), upright pictures.
     """
     spacing = np.pi / 2 if cameras == 2 else 2 * np.pi / cameras
     camera = np.arange(cameras)[:, None]
@@ -153,13 +142,7 @@ def moments(first_s: float, last_s: float) -> Float:
 
 
 def ring_slots(formation: FormationSettings, count: int, actor: Float, t_s: Float) -> Float:
-    """Compute slots [N, T, 3] m on a ring about the actor; obstacles are ignored.
-
-    Args:
-        formation: the ring; its `planner` does not matter here.
-        actor: [T, 3] m, a smooth point of the actor.
-        t_s: [T] seconds.
-    """
+    """Compute slots [N, T, 3] m on a ring about the actor [T, 3] m; obstacles are ignored."""
     position, _ = orbit(
         t_s,
         actor,
@@ -174,17 +157,11 @@ def ring_slots(formation: FormationSettings, count: int, actor: Float, t_s: Floa
 
 
 def fly(slots: Float, aim: Float, t_s: Float, limits: Limits) -> DronePaths:
-    """Fly after slots that are known in advance.
+    """Fly after slots [N, T, 3] m of the bodies that are known in advance; cameras look at `aim` [T, 3] m.
 
     The drones start in their slots and move with them as fast as the limits allow. A drone lags behind a slot
     that accelerates by `a` by about a / (POSITION_GAIN_PER_S VELOCITY_GAIN_PER_S): the slot's velocity is fed
     forward, its acceleration is not. The camera lags by the rate at which its aim turns times GIMBAL_LAG_S.
-
-    Args:
-        slots: [N, T, 3] m, of the bodies' origins.
-        aim: [T, 3] m, the point that the cameras look at.
-        t_s: [T] seconds, strictly increasing (`moments`).
-        limits: of speed and acceleration; neither is ever exceeded.
     """
     velocity = np.gradient(slots, t_s, axis=1) if len(t_s) > 1 else np.zeros_like(slots)
     flight = _Flight.starting(slots[:, :1], velocity[:, :1], t_s, limits)
@@ -203,17 +180,10 @@ def fly_with(
     actor: Float,
     rate_hz: float,
 ) -> DronePaths:
-    """Fly after slots that a planner gives during the flight.
+    """Fly after slots that a planner gives during the flight; the drones hover at `start` [N, 3] m at first.
 
-    Args:
-        planner: called at the first of the moments `t_s` and then at the first one at or after every
-            further 1 / `rate_hz`.
-        start: [N, 3] m, the positions where the drones hover at first.
-        aim: [T, 3] m, the point that the cameras look at.
-        t_s: [T] seconds, strictly increasing (`moments`).
-        limits: of speed and acceleration; neither is ever exceeded.
-        actor_t_s: [M] seconds, increasing: times of the actor's position estimates.
-        actor: [M, 3] m, the estimates.
+    The planner is called at the first of the moments `t_s` and then at the first one at or after every
+    further 1 / `rate_hz`. It knows the estimates [M, 3] m of the actor so far.
     """
     flight = _Flight.starting(start[:, None], np.zeros_like(start[:, None]), t_s, limits)
     ticks = np.floor((t_s - t_s[:1]) * rate_hz + 1e-9)
@@ -426,9 +396,8 @@ def log_times(rate_hz: float, span_s: tuple[float, float], rng: np.random.Genera
 def frame_times(lens: Lens, duration_s: float, rng: np.random.Generator) -> Int64:
     """Draw the stamps [F] of the frames that one camera kept, ns since the flight's start.
 
-    The shutter is periodic. It starts at a random time within the first frame's period, or at the flight's
-    start where shutters are synchronised. Frames are lost one by one with the lens's share; the first and the
-    last are kept.
+    The shutter starts at a random time within the first frame's period, or at the flight's start where
+    shutters are synchronised. Frames are lost one by one; the first and the last are kept.
     """
     phase = rng.random() * (lens.shutters == "free")
     count = max(0, int(np.ceil(duration_s * lens.rate_hz - phase)))
@@ -484,18 +453,11 @@ def gimbal_attitude(camera_xyzw: Float) -> Float:
 def estimate(truth: DronePoses, models: Sequence[NoiseModel], rng: np.random.Generator) -> PoseLog:
     """Simulate one drone's log with the errors of some models, and the covariances that belong to them.
 
-    The models' errors are the camera's. The body is logged where a camera with those errors has it: body
-    and gimbal share the error in rotation, as both come from the same estimate of north and down, and
-    the angles between them are exact.
-
-    Args:
-        truth: the true poses, stamps strictly increasing.
-        models: the errors, drawn in this order.
-
-    Returns:
-        Poses whose covariances [M, 6, 6] (position in world, rotation vector in the body or the camera)
-        hold the models' marginal sigmas at each stamp; None if no model has any. ROS states
-        rotations about fixed axes: `pose_covariance_in_body(covariance, conjugate(quaternion))`.
+    The models' errors, drawn in this order, are the camera's. The body is logged where a camera with those
+    errors has it: body and gimbal share the error in rotation, and the angles between them are exact.
+    Covariances [M, 6, 6] (position in world, rotation vector in the body or the camera) hold the models'
+    marginal sigmas at each stamp; None if no model has any. ROS states rotations about fixed axes:
+    `pose_covariance_in_body(covariance, conjugate(quaternion))`.
     """
     true_camera = truth.camera_position, truth.camera_quaternion_xyzw
     camera_from_body = compose(invert(*true_camera), (truth.position, truth.quaternion_xyzw))
@@ -523,20 +485,10 @@ def estimate_actor(
     span_s: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Int64, Float]:
-    """Simulate the estimated positions of the actor's hip.
+    """Simulate estimates of the actor's hip [T, 3] m: stamps [M], ns since the start, and positions [M, 3].
 
     The error is a Gauss-Markov process: `sigma_m` per axis at any moment, and correlated over
-    ACTOR_CORRELATION_S.
-
-    Args:
-        t_s: [T] seconds, strictly increasing.
-        hip: [T, 3] m, the truth; linear between the moments.
-        sigma_m: of the error, per axis.
-        rate_hz: rate of the logged estimates.
-        span_s: first and last second of the log, within `t_s`.
-
-    Returns:
-        Stamps [M], ns since the flight's start, and positions [M, 3]; never NaN.
+    ACTOR_CORRELATION_S. The log's span lies within `t_s`.
     """
     t_ns = log_times(rate_hz, span_s, rng)
     grid_ns = _nanoseconds(t_s)

@@ -88,12 +88,9 @@ class Roll:
 
 
 def roll(run: float, before: float, after: float) -> Roll:
-    """Compute the roll of a foot.
+    """Compute the roll of a foot; `run` is 0 for walking, 1 for running.
 
-    Args:
-        run: 0 for walking, 1 for running.
-        before: length of the swing that ends with the strike, as a share of a full stride's.
-        after: the same of the swing that follows.
+    `before` and `after` are the lengths of the swings about the strike, as shares of a full stride's.
     """
 
     def mix(walk: tuple[tuple[float, float], ...], jog: tuple[tuple[float, float], ...]) -> list[list[float]]:
@@ -138,11 +135,7 @@ class Swing:
 def body_swing(stride: Float, speed_mps: Float, run: Float, arm_share: float) -> Swing:
     """Compute pelvis, trunk and arms. The left heel strikes at stride angle 0, the right at pi.
 
-    Args:
-        stride: [T] rad.
-        speed_mps: [T]; all but the arms' rest swells with it and is gone at 0.
-        run: [T] 0 for walking, 1 for running.
-        arm_share: amplitude of the arms' swing, as a share of the usual one.
+    All but the arms' rest swells with the speed and is gone at 0. `run` is 0 for walking, 1 for running.
     """
     walk = 1 - run
     size = 1.3 * np.tanh(speed_mps * np.arctanh(1 / 1.3) / WALK_SPEED_MPS)  # 1 at the usual speed
@@ -169,15 +162,10 @@ def body_swing(stride: Float, speed_mps: Float, run: Float, arm_share: float) ->
 
 
 def bounce_m(stride: Float, step_s: Float, swing_share: Float) -> Float:
-    """Compute the height of a runner's pelvis above its height at the strikes, [T] m.
+    """Compute the height of a runner's pelvis above its height at the strikes, every multiple of pi, [T] m.
 
-    Free fall while both feet are off, a half sine on the springy leg; the speeds are equal where they meet
-    (the spring-mass runner of Blickhan 1989).
-
-    Args:
-        stride: [T] rad, a strike at every multiple of pi.
-        step_s: [T] duration of a step.
-        swing_share: [T] of a step for which both feet are off the ground.
+    Free fall while both feet are off (`swing_share` of a step), a half sine on the springy leg; the speeds
+    are equal where they meet (the spring-mass runner of Blickhan 1989).
     """
     since = np.mod(stride / np.pi, 1.0)  # of a step, from the strike
     flight = np.clip(swing_share, 0.0, 0.9)
@@ -279,9 +267,7 @@ class Pace:
 
 
 def pace(parts: Sequence[WayPart]) -> Pace:
-    """Compute speeds over time from a stand to a stand.
-
-    Each part has its own speed where it is long enough for that.
+    """Compute speeds over time from a stand to a stand; each part has its own where it is long enough.
 
     Speed goes from one knot to the next as a smooth step, at `_WALK_MPS2` or `_RUN_MPS2` on average; where a
     part is slower than the next, it is slower to its end.
@@ -314,9 +300,9 @@ _SAME_MOMENT_S = 1e-6
 class Keys:
     """Named curves through key values; a curve without keys is 0.
 
-    Between keys a curve is the monotone cubic of Fritsch & Carlson 1980: its slope is continuous, it never
-    leaves the span of two neighbouring keys, and it stays exactly constant between equal ones. This keeps a
-    planted foot in its place. Before the first and after the last key the curve is constant.
+    Curves are monotone cubics (Fritsch & Carlson 1980): smooth, never beyond two neighbouring keys, and
+    constant between equal ones, which keeps a planted foot in its place. They are constant before the first
+    and after the last key.
     """
 
     def __init__(self) -> None:

@@ -62,15 +62,10 @@ class Foot:
 def foot_over_time(
     rig: Rig, side: int, t_s: Float, steps: Sequence[Footstep], extra: Keys, ground: Heights
 ) -> Foot:
-    """Compute the place and the attitude of a foot over time.
+    """Compute the place and the attitude of a foot over time [T]; side 0 is left.
 
-    Args:
-        side: 0 is left.
-        t_s: [T]
-        steps: in the order of time; the first only gives the foot's place at the beginning.
-        extra: curves beside the steps: `heel_deg`, the angle by which both heels are raised, `left_kick`,
-            `right_kick`.
-        ground: heights of places [N, 2].
+    The first of the steps only gives the foot's place at the beginning. `extra` are curves beside the steps:
+    `heel_deg`, by which both heels are raised, `left_kick`, `right_kick`.
     """
     keys = _keys_of_steps(steps, leg_m=rig.length_of_leg)
     curve = {name: keys.at(name, t_s) for name in ("x", "y", "yaw", "clear", "soft", "bent", "carries")}
@@ -235,19 +230,11 @@ _STRETCHED_M = 0.002
 
 
 def two_bones(upper: Float, lower: Float, towards: Float, hinge: Float) -> tuple[Float, Float]:
-    """Turn two bones so that the end of the second reaches a point; in closed form (law of cosines).
+    """Return the rotations [T, 4] of two bones whose end is at `towards` [T, 3], or points there.
 
-    The limb bends about `hinge`: a knee with the hinge to the left goes ahead, an elbow whose hinge points
-    right goes back. The limb points at points out of reach.
-
-    Args:
-        upper: [3] m, the neutral vector from the first joint to the second.
-        lower: [3] m, from the second joint to the end.
-        towards: [T, 3] m, from the first joint to the wanted place of the end.
-        hinge: [T, 3] any vector not along the limb; only its part across the limb counts.
-
-    Returns:
-        [T, 4] world rotations of the two bones, from neutral.
+    `upper` and `lower` [3] m are neutral; all is relative to the first joint, by the law of cosines. The limb
+    bends about the part of `hinge` [T, 3] across it: a knee with the hinge to the left goes ahead, an elbow
+    whose hinge points right goes back.
     """
     first, second = (float(np.sqrt(np.sum(bone**2))) for bone in (upper, lower))
     wanted = np.sqrt(np.sum(towards**2, axis=1))
@@ -286,17 +273,9 @@ def pelvis_height(
     wanted_m: Float,
     softness_m: Float,
 ) -> Float:
-    """Return the wanted height, or as much of it as the carrying legs allow with their least knee flexion.
+    """Return the wanted height [T] m, or what the carrying legs allow with their least knee flexion.
 
-    Args:
-        place: [T, 2] m of the pelvis's joint.
-        pelvis: [T, 4] its rotation.
-        feet: left, right.
-        wanted_m: [T] height in the world.
-        softness_m: [T] distance of two of these bounds within which one blends into the other.
-
-    Returns:
-        [T] m, world.
+    Bounds nearer to each other than `softness_m` [T] blend. The pelvis's joint is at `place` [T, 2] m.
     """
     height = wanted_m
     for foot, side in zip(feet, SIDES, strict=True):
@@ -357,14 +336,7 @@ class Style:
 def bodies(
     rig: Rig, plan: Plan, style: Style, t_s: Float, start: Float, heading: float, ground: Heights
 ) -> BodyMotion:
-    """Pose all bones.
-
-    Args:
-        t_s: [T]
-        start: [2] m, the place where the plan began.
-        heading: rad, at the start of the plan.
-        ground: heights of places [N, 2].
-    """
+    """Pose all bones from the plan's start [2] m and heading (rad), over the ground's heights."""
     keys = plan.keys
     place, yaw = plan.body_at(t_s, start, heading)
     run = keys.at("running", t_s)
@@ -628,13 +600,12 @@ _LIFT_S, _LAND_S, _CLOSE_S, _STAND_S = -0.15, 0.68, 0.78, 1.22
 def kick(plan: Plan, side: str, run_up_m: float) -> None:
     """Plan an instep kick at a ball: run up, plant the other foot, swing back, kick, follow through, stand.
 
-    The angles are read off Lees, Asai, Andersen, Nunome & Sterzing, "The biomechanics of kicking in
-    soccer" (J. Sports Sci. 2010) and Nunome, Asai, Ikegami & Sakurai, "Three-dimensional kinetic analysis
-    of side-foot and instep soccer kicks" (Med. Sci. Sports Exerc. 2002): the approach at 3 to 4 m/s slows
-    down over the plant foot; the hip is extended by some 30 deg and the knee flexed beyond 100 deg after
-    the plant; the pelvis turns through some 40 deg; the knee extends at more than 1,000 deg/s and is still
-    bent at the impact, 0.19 s after the plant; the trunk leans back and to the side of the support foot,
-    whose arm is spread behind and comes across.
+    The angles are read off Lees et al., "The biomechanics of kicking in soccer" (J. Sports Sci. 2010) and
+    Nunome et al., "Three-dimensional kinetic analysis of side-foot and instep soccer kicks" (Med. Sci. Sports
+    Exerc. 2002): the approach at 3 to 4 m/s slows down over the plant foot; the hip is extended by some 30
+    deg and the knee flexed beyond 100 deg after the plant; the pelvis turns through some 40 deg; the knee
+    extends at more than 1,000 deg/s and is still bent at the impact, 0.19 s after the plant; the trunk leans
+    back and to the support foot's side, whose arm is spread behind and comes across.
     """
     foot, support = (LEFT, RIGHT) if side == "left" else (RIGHT, LEFT)
     speed = min((2 * _RUN_UP_MPS2 * run_up_m) ** 0.5, _FASTEST_RUN_UP_MPS)

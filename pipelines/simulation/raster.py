@@ -1,10 +1,9 @@
 """Triangles to samples, samples to fragments, and the shadows on them.
 
-A picture has `SUBROWS` sample rows per pixel row, each with its own shift in x (a rotated grid), so a
-pixel has four samples with four distinct x and four distinct y: edges near the horizontal and the
-vertical, where a regular 2 x 2 grid shows two steps, get four. With one sample row per pixel row the
-samples are the pixel centres. A fragment is a piece of surface that makes up a part of a pixel; it is shaded
-once.
+A picture has `SUBROWS` sample rows per pixel row, each shifted in x (a rotated grid), so that edges near the
+horizontal and the vertical get four steps where a regular 2 x 2 grid shows two. With one sample row per pixel
+row the samples are the pixel centres. A fragment is a piece of surface that makes up a part of a pixel; it is
+shaded once.
 """
 
 from collections.abc import Sequence
@@ -371,12 +370,11 @@ def room_for(count: int) -> Fragments:
 def gather(
     band: Band, first_row: int, view: CameraView, mesh: Mesh, fragments: Fragments, sky: Float32
 ) -> int:
-    """Find the fragments of a band's pixels, and their number.
+    """Find the fragments of a band's pixels, drawn with `SHIFTS_PX`, and their number.
 
-    Samples of one face in one pixel become one fragment at their common centre, which lies on the face and
-    inside it. Samples without a face see land below the horizon, and nothing above. The band was drawn with
-    `SHIFTS_PX`, `first_row` is its first row in the picture. Filled are `fragments`, with room for as many
-    as there are samples, and `sky` [R * W], the share of each pixel's samples that see nothing.
+    Samples of one face in one pixel become one fragment at their common centre, inside the face. Samples
+    without a face see land below the horizon, and nothing above. `fragments` has room for as many as there
+    are samples; `sky` [R * W] becomes the share of each pixel's samples that see nothing.
     """
     nearness, source = band
     position, turn, pinhole, land = view

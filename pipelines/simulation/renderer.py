@@ -51,11 +51,10 @@ def shade(
     view: CameraView,
     light: Float32,
 ) -> None:
-    """Write the light [R, W, 3] of the pixels of a band: the mean of the light at their samples.
+    """Write the light [R, W, 3] of a band's pixels from `first_row` on: the mean of that at their samples.
 
     `sun` [N] is the cosine of the sun's incidence times the share of it that reaches a fragment, `sky` [R *
-    W] the share of each pixel's samples that see sky, `first_row` the row of the picture that is the band's
-    first.
+    W] the share of each pixel's samples that see sky.
     """
     _fill_sky(sky, first_row, view.world_from_camera, view.pinhole, light)
     _add(
@@ -303,13 +302,7 @@ class DistortingLens:
         return slice(int(of.min()) - _MARGIN_PX + 1, int(of.max()) + _MARGIN_PX)
 
     def bent(self, light: Float32, first_row: int, part: slice) -> Float32:
-        """Bend the light [R, W, 3] of some rows of the picture.
-
-        Args:
-            light: [S, V, 3] of the pinhole's rows from `first_row` on.
-            first_row: see `rows`.
-            part: the rows of the lens's picture.
-        """
+        """Bend the pinhole's light [S, V, 3] from `first_row` on (`rows`) to `part` of the lens's rows."""
         import cv2
 
         to: NDArray[Any] = self._map[part] - np.array([0, first_row], np.float32)
@@ -409,14 +402,10 @@ seventh of the sensor's noise."""
 
 
 def exposed_moments(rows: int, *, exposure_s: float, readout_s: float) -> tuple[Float, Float]:
-    """Choose moments whose weighted means are the rows of a picture, read from the first to the last.
+    """Choose a readout's moments [K] s about the picture's time and weights [K, rows]; columns add up to 1.
 
-    A row's light is the mean over its exposure of light that changes linearly between the moments. The
-    middle of the middle row's exposure is the picture's time. `readout_s` is from the first row to the
-    last.
-
-    Returns:
-        [K] s against the picture's time, ascending, and [K, rows] weights whose columns add up to 1.
+    A row's light is the mean over its exposure of light that changes linearly between the ascending moments.
+    The middle of the middle row's exposure is the picture's time; `readout_s` is from first row to last.
     """
     # An even number of steps: the picture's own time is one of the moments.
     steps = 2 * int(np.ceil((exposure_s + readout_s) / (2 * STEP_S) - 1e-9))
@@ -470,17 +459,11 @@ class ExposedMoment(NamedTuple):
 class Renderer:
     """A world and a camera that takes pictures of it; several threads may share one.
 
-    Everything is opaque and matt. The sun casts shadows, the sky lights without them. Where the mesh of
-    the ground ends, land goes on level at the height of its lowest point, to the horizon.
-
-    Args:
-        static: the surfaces that do not move.
-        intrinsics: the camera. Its readout is up to the caller, who asks for several moments (`exposed`).
-        sun: [3] direction towards it, of any length.
-        seed: of the ground's texture and of the sensor's noise.
-
-    ValueError: distortion whose model does not reach the whole picture, or a sun that is not above the
-    horizon.
+    Everything is opaque and matt. The sun, in the direction [3], casts shadows, the sky lights without them.
+    Where the mesh of the ground ends, land goes on level at the height of its lowest point, to the horizon. A
+    readout is up to the caller, who asks for several moments (`exposed`). The seed is that of the ground's
+    texture and of the sensor's noise. ValueError: distortion whose model does not reach the whole picture, or
+    a sun that is not above the horizon.
     """
 
     def __init__(
@@ -502,31 +485,20 @@ class Renderer:
     def picture(
         self, position: Float, quaternion_xyzw: Float, people: Sequence[TriangleSurface], frame: int
     ) -> Bytes:
-        """Render the camera's picture.
+        """Render the camera's picture [H, W, 3] BGR; equal arguments give equal bytes.
 
-        Args:
-            position: [3] m, of the camera in the world.
-            quaternion_xyzw: [4] world_from_camera.
-            people: the surfaces that move.
-            frame: number of the picture; with the seed and the position it fixes the noise.
-
-        Returns:
-            [H, W, 3] BGR; equal arguments give equal bytes.
+        People are the surfaces that move. The pose is world_from_camera. The noise follows from seed,
+        position and `frame`.
         """
         return self.exposed(
             [ExposedMoment(position, quaternion_xyzw, people)], np.ones((1, self._size[0])), frame
         )
 
     def exposed(self, moments: Sequence[ExposedMoment], weights: Float, frame: int) -> Bytes:
-        """Render what the camera sees while its rows are exposed.
+        """Render [H, W, 3] BGR, its rows exposed one after the other; equal arguments give equal bytes.
 
-        Args:
-            moments: K of them, the picture's own time in the middle.
-            weights: [K, H] how much of each row's light is each moment's; columns add up to 1.
-            frame: number of the picture; with the seed and the middle moment's position it fixes the noise.
-
-        Returns:
-            [H, W, 3] BGR; equal arguments give equal bytes.
+        `weights` [K, H], columns adding up to 1, are the shares of the moments in each row's light. The
+        picture's own time is in the middle; noise is that of `picture` there.
         """
         light = np.zeros((*self._size, 3), np.float32)
         for moment, share in zip(moments, np.asarray(weights, np.float32), strict=True):

@@ -46,13 +46,12 @@ _LIMB_ABOVE = {"shank": "thigh", "foot": "shank", "forearm": "upper_arm"}
 
 
 def match_bones(source: SkeletalMotion) -> dict[str, int]:
-    """Find the bone of the source that moves as each of ours does.
+    """Find the bone of the source that moves as each of ours does. DataError: essential ones were not found.
 
     Names are compared without prefix (`mixamorig:`, `Bip01_`), case and separators; a side is `left`,
     `right`, or a lone `l` or `r` before or after. The trunk is the chain from the pelvis to the bone that
     both arms hang on; spine, back and chest are its first, middle and last bone. A part that the source lacks
-    moves with its parent: toes with the foot, hands with the forearm, clavicles with the chest. DataError:
-    essential bones were not found; the message lists them and the source's bones.
+    moves with its parent: toes with the foot, hands with the forearm, clavicles with the chest.
     """
     named: dict[tuple[str, str], int] = {}
     for index, name in enumerate(source.bones):
@@ -162,23 +161,15 @@ def retarget(
     heading_deg: float,
     repeat: bool,
 ) -> BodyMotion:
-    """Move our bones as those of a recording.
+    """Move our bones (`match_bones`) as those of a recording, over the ground's heights at places [N, 2].
 
-    Bones are matched by name (`match_bones`), and turned as the source's are turned from its rest pose, after
-    the limbs of our neutral pose were laid along those of that rest pose: arms that hang along arms of a
-    T-pose. The rest pose is taken to stand upright. The way of the pelvis is scaled by the length of the
-    legs, begins at `start` and looks along `heading_deg`. Heights over the ground are those of the recording
-    over its floor, scaled. A foot that would come below the ground is lifted, its knee bending. A single
-    frame at the beginning from which the pose jumps (a T-pose for calibration) is left out.
-
-    Args:
-        t_s: [T] seconds; beyond the end of the recording its last pose is held, or it begins again.
-        ground: heights of places [N, 2].
-        start: [2] m.
-        heading_deg: counterclockwise from east.
-        repeat: begin again where it ended; the last half second is bent to the first pose.
-
-    DataError: the bones of a person were not found, or a leg of the source has no length.
+    Bones are turned as the source's are from its upright rest pose, after the limbs of our neutral pose were
+    laid along those of that rest pose: arms that hang along arms of a T-pose. The way of the pelvis is scaled
+    by the length of the legs, begins at `start` [2] m and looks along `heading_deg`, counterclockwise from
+    east. Heights are those of the recording over its floor, scaled. A foot below the ground is lifted, its
+    knee bending. A single frame at the beginning from which the pose jumps (a T-pose for calibration) is left
+    out. Beyond the recording's end the last pose is held, or with `repeat` it begins again there; its last
+    half second is bent to the first pose. DataError: no bones of a person, or a leg of no length.
     """
     match = match_bones(source)
     source = _without_first_pose(source)

@@ -1,10 +1,10 @@
 """A walking person as the cameras of a formation see them, and the measures of what was seen.
 
-No drone flies in a study: the cameras are exactly in their slots about the walking person at every moment and
-look at the person, as in the simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with
-Collaborative Aerial Cameras". Only the keypoints and the logged poses have errors, of known size. Trial k of
-camera i has the same random numbers in every formation and for every size of the errors, so that differences
-between formations are not due to chance. Stage `film` measures the arms of a comparison in the same way.
+No drone flies in a study: the cameras are exactly in their slots about the person at every moment, as in the
+simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with Collaborative Aerial Cameras".
+Only the keypoints and the logged poses have errors, of known size. Trial k of camera i has the same random
+numbers in every formation and for every size of the errors, so that differences are not due to chance. Stage
+`film` measures the arms of a comparison in the same way.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -290,12 +290,7 @@ def measure_arm(
 def errors_in_common(
     points: Mapping[str, Float], true_joints: Mapping[str, Float]
 ) -> dict[str, float | None]:
-    """Compute each arm's MPJPE (mm) on the joint-frames that all arms reconstructed; None if there are none.
-
-    Args:
-        points: [T, J, 3] m of every arm, NaN for joints that were not reconstructed.
-        true_joints: [T, J, 3] m of every arm.
-    """
+    """Compute each arm's MPJPE (mm) on the joint-frames [T, J, 3] m that all arms have; None without any."""
     shared = common(*(own[:, None] for own in points.values()))[:, 0]
     found: dict[str, float | None] = {}
     for name, own in points.items():
@@ -375,11 +370,8 @@ class WalkStudy:
 def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
     """Return the settings of a study; what is not stated is as in the experiments of Ho et al.
 
-    Args:
-        stated: variable (of `KNOWN`) to its values, as users write them. `noise` has names of `LEVELS` (white
-            noise), or models as `--pose-noise` has them.
-
-    DataError: an unknown name, a value given twice, or a number out of range.
+    `noise` has names of `LEVELS` (white noise), or models as `--pose-noise` has them. DataError: an unknown
+    name of a variable (`KNOWN`), a value given twice, or a number out of range.
     """
     values = {**_USUAL, "rate_hz": (), **stated}
     unknown = [name for name in values if name not in KNOWN]

@@ -171,16 +171,10 @@ def plant(
     standing: Sequence[scenario.Tree],
     walls: Sequence[scenario.Wall],
 ) -> list[scenario.Tree]:
-    """Place a wood's trees at random, evenly over its circle.
+    """Place a wood's trees at random, evenly over its circle. DataError: they do not fit.
 
-    Args:
-        wood: number and place of the trees.
-        rng: decides the places and the sizes.
-        keep_clear: [K, 2] m, points of the actor's way; no trunk's axis is nearer to one than `clear_m`.
-        standing: trees that are there already; new ones keep apart from them and from each other.
-        walls: new trees keep their trunks out of them.
-
-    DataError: they do not fit.
+    Trees keep apart from each other, from those standing and from walls, and no trunk's axis is nearer than
+    `clear_m` to a point [K, 2] m of the actor's way (`keep_clear`).
     """
     trees = list(standing)
     for planted in range(wood.count):
@@ -259,12 +253,11 @@ class Obstacles:
 def erect(
     terrain: MoundedGround, trees: Sequence[scenario.Tree], walls: Sequence[scenario.Wall]
 ) -> Obstacles:
-    """Stand trees and walls on the ground.
+    """Stand trees and walls on the ground. DataError: a wall begins where it ends.
 
-    A tree's crown is the upper 62 % of its height; its trunk, 3 % of the height in radius, ends in the
-    crown's middle. A wall is level on top, `height_m` above the highest ground under its line, so that it is
-    nowhere lower. Both reach below the lowest ground that they stand on. DataError: a wall begins where it
-    ends.
+    A crown is the upper 62 % of a tree; the trunk, 3 % of the height in radius, ends in the crown's middle. A
+    wall is level on top, `height_m` above the highest ground under its line. Both reach below the lowest
+    ground that they stand on.
     """
     return Obstacles(
         np.array([_trunk(terrain, tree) for tree in trees]).reshape(-1, 5),
@@ -498,9 +491,9 @@ class World:
     def surfaces(self) -> list[TriangleSurface]:
         """Return the visible surfaces: the ground out to the horizon, then trunks, crowns and walls if any.
 
-        The ground is within 2 cm of `height`, trunks within 4 % of their radius, walls exact. Crowns are
-        ragged: leaves end up to a fifth beyond or three tenths short of the ellipsoid of `hidden`.
-        From any side, the two outlines share about nine tenths of their union.
+        The ground is within 2 cm of `height`, trunks within 4 % of their radius, walls exact. Leaves end up
+        to a fifth beyond or three tenths short of the ellipsoid of `hidden`; the outlines share about nine
+        tenths.
         """
         return [
             ground_surface(self.ground, self.terrain),
@@ -587,9 +580,9 @@ class World:
     def occupancy(self, resolution_m: float, height_m: float) -> Occupancy:
         """Return voxels over the ground's square, from one below z = 0 up to a height: 1 occupied, 0 free.
 
-        A voxel is occupied if the inside of a solid and of the voxel have a point in common. The test is
-        exact for trunks, crowns and slabs. Over mounds it errs towards occupied, by at most 5 % of a voxel
-        unless a mound is narrower than a tenth of one. Voxels lie on multiples of `resolution_m`.
+        A voxel, on multiples of `resolution_m`, is occupied if the inside of a solid meets its own: exact for
+        trunks, crowns and slabs, over mounds by at most 5 % of a voxel too much unless one is narrower than a
+        tenth of it.
         """
         side, half, middle = resolution_m, self.ground.size_m / 2, np.array(self.ground.centre)
         first = np.floor((middle - half) / side + _TOUCH_M).astype(np.int64)
