@@ -33,7 +33,7 @@ from pipelines.drafting.found import (
 )
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import Ask, MotionMatch, match
-from pipelines.drafting.motion import TrackedPoints, explain_motion
+from pipelines.drafting.motion import TrackedPoints, explain_motion, explains_better
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
@@ -521,23 +521,31 @@ class _MotionComparison:
         if film.made_ns is not None and found.span and found.span.first_ns > NO_DATE_NS:
             within &= np.abs(t_ns - film.made_ns) <= 2 * film.length_ns + MADE_WITHIN_NS
         ahead = body_from_camera("forward")
-        tried: list[tuple[Float, Proposal | None, RelativeTo]] = [
-            (multiply(attitude, ahead), gimbal, relative_to)
-            for gimbal in gimbals
-            for relative_to, attitude in _turned_by(gimbal, t_ns, body)
-        ]
-        if not tried and found.of_body:
-            downs = (body_from_camera("forward", deg) for deg in TRIED_DOWN_DEG)
-            tried = [(multiply(body, mount), None, "world") for mount in downs]
-        matches: list[MotionMatch] = []
-        for turned, gimbal, relative_to in tried or [(body, None, "world")]:
+
+        def match(
+            turned: Float, gimbal: Proposal | None = None, of: RelativeTo = "world"
+        ) -> MotionMatch | None:
             rows = within & np.isfinite(turned).all(axis=1)
             explained = explain_motion(
                 t_ns[rows], position[rows], turned[rows], self._followed[film.path], max_gap_ns=MAX_GAP_NS
             )
-            if explained is not None:
-                matches.append(MotionMatch(*explained, gimbal, relative_to))
-        return max(matches, key=lambda alike: float(np.nansum(alike.gain)), default=None)
+            return None if explained is None else MotionMatch(*explained, gimbal, of)
+
+        best: MotionMatch | None = None
+        turning = [(gimbal, turn) for gimbal in gimbals for turn in _turned_by(gimbal, t_ns, body)]
+        for gimbal, (relative_to, attitude) in turning:
+            other = match(multiply(attitude, ahead), gimbal, relative_to)
+            if other and (best is None or np.nansum(other.gain) > np.nansum(best.gain)):
+                best = other
+        own = match(body)
+        if turning or (isinstance(found, FlownPoses) and not found.of_body):
+            return best if turning else own
+        for down_deg in TRIED_DOWN_DEG:
+            other = match(multiply(body, body_from_camera("forward", down_deg)))
+            if other and (best is None or explains_better(other.gain, best.gain)):
+                best = replace(other, of_body=True, down_deg=down_deg)
+        named, other = (best, own) if found.of_body else (own, best)
+        return other if other and named and explains_better(other.gain, named.gain) else named
 
 
 def _turned_by(gimbal: Proposal, t_ns: Int64, body: Float) -> Iterator[tuple[RelativeTo, Float]]:

@@ -284,6 +284,10 @@ class _ManifestWriter:
                 step_s = taken.step_ns / 1e9
                 gap = f"ingest with --max-pose-gap {1.5 * step_s:.3g}"
                 remarks.append(f"a position every {step_s:.3g} s: {gap}")
+        elif _is_of_body(camera) != taken.of_body:
+            own = "body" if _is_of_body(camera) else "camera"
+            remarks.append(self.assume(camera, "pose", f"poses of the {own}, as its pictures move"))
+            return self.entry("pose", [taken, *choice.others], remarks, {**taken.settings, "of": own})
         elif taken.kind == "pose" and not taken.topic and "parent" not in taken.settings:
             remarks.append("if of the body, not the camera: add of: body, and a mount")
         if _is_turned_by_film(camera):
@@ -307,7 +311,7 @@ class _ManifestWriter:
             return {"gimbal": DraftedKey(None, [why], example={"yaw_deg": 90, "pitch_deg": -30})}
         example = {"looks": "forward", "translation": [0, 0, 0]}
         lever = DraftedKey(None, ["the lever arm to the gimbal, m"], example=example)
-        if not (taken.of_body or taken.unturned):
+        if not (_is_of_body(camera) or taken.unturned):
             return {"mount": lever} if isinstance(taken, FlownPoses) else {}
         if gimbal is not None:
             return {"gimbal": self._gimbal(camera, gimbal), "mount": lever}
@@ -330,10 +334,12 @@ class _ManifestWriter:
         return DraftedKey(self.guessed(stated), remarks, others)
 
     def _fixed_mount(self, camera: CameraDraft) -> DraftedKey:
-        remark = self.assume(camera, "mount", "the camera looks forward, level, from the body's origin")
+        down_deg = camera.motion.down_deg if camera.motion else 0
+        tilt = f"{down_deg:g} deg down, as its pictures move" if down_deg else "level"
+        remark = self.assume(camera, "mount", f"the camera looks forward, {tilt}, from the body's origin")
         by_film = "# or, in place of the mount: pose: {..., attitude: pictures}"
         return DraftedKey(
-            self.guessed({"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}),
+            self.guessed({"looks": "forward", "down_deg": down_deg, "translation": [0, 0, 0]}),
             [remark],
             [by_film] if camera.film else [],
         )
@@ -349,7 +355,7 @@ class _ManifestWriter:
             numbers = {"width": 1920, "height": 1080, "fx": 1400, "fy": 1400, "cx": 959.5, "cy": 539.5}
             others = self.others("intrinsics", self.draft.free_intrinsics)
             return DraftedKey(None, [remark], others, example=numbers)
-        what = "that one calibration holds for them"
+        what = choice.why or "that one calibration holds for them"
         remarks = [] if choice.named else [self.assume(camera, "intrinsics", what)]
         settings = choice.taken.settings
         if settings.get("camera") == camera.name:  # its own name need not be stated
@@ -450,6 +456,14 @@ class _ManifestWriter:
                 about += "; if known to be true: truth: FILE"
             lines.append(f"#   {flow(self._relative(found.path))}  ({one_line(about)})")
         return lines
+
+
+def _is_of_body(camera: CameraDraft) -> bool:
+    """Test if a camera's poses are those of its drone: by the motion in its pictures, else by their name."""
+    taken, motion = camera.choices["pose"].taken, camera.motion
+    if motion is None or motion.gimbal is not None or taken.unturned:
+        return taken.of_body
+    return motion.of_body
 
 
 def _is_turned_by_film(camera: CameraDraft) -> bool:

@@ -71,6 +71,8 @@ class MotionMatch:
     start_ns: int  # of the video, on the log's clock
     gimbal: Proposal | None = None  # the angles that turn the camera, if any do
     relative_to: RelativeTo = "world"  # what these angles are relative to
+    of_body: bool = False  # the poses are the body's and a mount turns the camera
+    down_deg: float = 0.0  # its tilt
 
 
 Compare = Callable[[FoundFilm, Proposal, Sequence[Proposal]], MotionMatch | None]
@@ -119,7 +121,8 @@ class CameraDraft:
     pictures: dict[str, list[Proposal]] = field(default_factory=lambda: {"video": [], "keypoints": []})
     paired: bool = False  # video and keypoints are matched only because nothing else is left
     choices: dict[str, Chosen] = field(default_factory=dict)
-    gimbal_reference: RelativeTo | None = None  # what its gimbal's angles are relative to, by its pictures
+    gimbal_reference: RelativeTo | None = None  # what its gimbal's angles are relative to
+    motion: MotionMatch | None = None  # of its video and poses, where they agree
     focal_35_mm: float | None = None  # as on film 36 mm wide, where no calibration has it
     true_poses: Chosen | None = None
 
@@ -196,6 +199,7 @@ def match(
         camera.choices = {part: choice for part, choice in found_choices.items() if choice is not None}
     _pair_by_content(cameras, moving, gimbals, of.get("intrinsics", []), compare)
     _prefer_attitudes(cameras, moving, distance)
+    _pair_the_last_lens(cameras, of.get("intrinsics", []))
     for camera in cameras:
         _ask_for_the_rest(camera, cameras, moving, of.get("intrinsics", []), ask)
     _find_lenses([c for c in cameras if c.film is not None and "intrinsics" not in c.choices], of, ask)
@@ -319,6 +323,15 @@ def _pair_the_last(cameras: list[CameraDraft]) -> None:
         cameras.remove(detected[0])
 
 
+def _pair_the_last_lens(cameras: Sequence[CameraDraft], intrinsics: Sequence[Proposal]) -> None:
+    """Give the only camera without a calibration the only one that no other camera has."""
+    wanting = [camera for camera in cameras if "intrinsics" not in camera.choices]
+    taken = [choice.taken for camera in cameras if (choice := camera.choices.get("intrinsics"))]
+    free = [lens for lens in intrinsics if lens not in taken]
+    if len(wanting) == len(free) == 1:
+        wanting[0].choices["intrinsics"] = Chosen(free[0], named=False, why="that the last one is its own")
+
+
 def _are_two(one: Label, other: Label) -> bool:
     """Test if labels share a word, as those of two drones do: drone 1, drone 2."""
     return bool({word.word for word in one} & {word.word for word in other})
@@ -361,6 +374,7 @@ def _pair_by_content(
         if motion is not None and sum(motion[0] is log for log, _ in found.values()) == 1:
             log, alike = motion
             camera.choices["pose"] = Chosen(log, named=False, why="by their motion", start_ns=alike.start_ns)
+            camera.motion = alike
             if alike.gimbal is not None:
                 camera.choices["gimbal"] = Chosen(alike.gimbal)
                 camera.gimbal_reference = alike.relative_to
@@ -379,11 +393,12 @@ def _settle_by_motion(camera: CameraDraft, compare: Compare) -> None:
         return
     pose, gimbal = choices["pose"], choices.get("gimbal")
     timed = "frame_times" in choices or pose.taken.path == film.path
-    if timed and gimbal is None:
+    if timed and gimbal is None and not pose.taken.of_body:
         return
     alike = compare(film, pose.taken, [gimbal.taken] if gimbal else [])
     if alike is None or not explains_better(alike.gain, np.zeros_like(alike.gain)):
         return
+    camera.motion = alike
     if alike.gimbal is not None:
         camera.gimbal_reference = alike.relative_to
     if not timed:

@@ -650,9 +650,9 @@ class Manifest(YamlModel):
             owners: dict[object, str] = {}
             for name, camera in self.cameras.items():
                 source = getattr(camera, part)
-                key = None if source is None else (source.file, source.topic)
-                if key is not None and owners.setdefault(key, name) != name:
-                    raise ValueError(f"cameras.{name}.{part}: is that of {owners[key]}, {source.file}")
+                same = source and owners.setdefault((source.file, source.topic), name)
+                if same not in {None, name}:
+                    raise ValueError(f"cameras.{name}.{part}: is that of {same}, {source.file}")
         return self
 
     @property

@@ -17,7 +17,8 @@ from pipelines.draft import draft
 from pipelines.drafting.matching import Answer, Question
 from pipelines.formats.poses import TUM
 from pipelines.geometry.geodesy import place_at
-from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.geometry.mounting import body_from_camera
+from pipelines.geometry.poses import conjugate, matrix_from_quaternion, multiply
 from tests.commands.runner import mocap
 from tests.synthetic.drone_logs import HOME, DroneTruth, angles_of, ulog_rows, write_dataflash, write_ulog
 from tests.synthetic.logged_flights import pose_entry
@@ -64,20 +65,23 @@ def copied(video: Path, path: Path, *, made_ns: int | None = None, pictures: int
                 target.mux(packet)
 
 
-def write_topics(path: Path, names: list[str]) -> None:
-    """Write the poses of the sample's cameras as topics of one log."""
+def write_topics(path: Path, topics: dict[str, str], down_deg: float | None = None) -> None:
+    """Write the poses of the sample's cameras as topics of one log; of bodies if the tilt is stated."""
     entries = []
-    for name in names:
+    for name, topic in topics.items():
         flown = TUM.read_trajectory(SAMPLE / "truth" / f"{name}.tum")
-        for t, at, turned in zip(
-            flown.t_ns.tolist(), flown.position.tolist(), flown.quaternion_xyzw.tolist(), strict=True
-        ):
-            entries.append(pose_entry(f"/{name}/camera_pose", t, at, turned))
+        turned = flown.quaternion_xyzw
+        if down_deg is not None:
+            turned = multiply(turned, conjugate(body_from_camera("forward", down_deg)))
+        rows = zip(flown.t_ns.tolist(), flown.position.tolist(), turned.tolist(), strict=True)
+        entries += [pose_entry(topic, *row) for row in rows]
     write_mcap(path, sorted(entries, key=lambda entry: entry.stamp_ns))
 
 
 def test_recorders_names_leave_the_choice_between_topics_and_no_calibration(tmp_path: Path) -> None:
-    write_topics(tmp_path / "rec_2023_A.mcap", ["drone1", "drone2"])
+    write_topics(
+        tmp_path / "rec_2023_A.mcap", {name: f"/{name}/camera_pose" for name in ("drone1", "drone2")}
+    )
     for name in ("DJI_0007", "DJI_0008"):
         write_video(tmp_path / f"{name}.MP4", even_ticks(60))
     lens = "size = [64, 48]\nmatrix = [[90, 0, 31.5], [0, 90, 23.5], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n"
@@ -144,6 +148,24 @@ def test_videos_and_logs_of_one_flight_are_paired_by_motion(tmp_path: Path) -> N
     for name, drone in (("north", "drone1"), ("lake", "drone2")):
         start_s = float(cameras[name]["frame_times"]["start"])
         assert start_s == pytest.approx(float(true[drone]["frame_times"]["start"]), abs=0.1)
+
+
+def test_motion_tells_poses_of_cameras_from_those_of_drones_and_the_tilt_of_a_mount(tmp_path: Path) -> None:
+    shutil.copyfile(SAMPLE / "drone1.mp4", tmp_path / "left.mp4")
+    shutil.copyfile(SAMPLE / "drone2.mp4", tmp_path / "IMG_4411.MOV")
+    write_topics(tmp_path / "rec.mcap", {"drone1": "/alpha/pose"})
+    write_topics(tmp_path / "other.mcap", {"drone2": "/bravo/pose"}, down_deg=30)
+    for name, drone in (("cam_left", "drone1"), ("cam_right", "drone2")):
+        lens = (SAMPLE / f"{drone}_camera.yaml").read_text(encoding="utf-8")
+        (tmp_path / f"{name}.yaml").write_text(lens.replace(drone, "camera"), encoding="utf-8")
+    cameras = cameras_of(tmp_path)
+    assert cameras["left"]["pose"] == {"file": "rec", "topic": "/alpha/pose", "of": "camera", "assumed": True}
+    assert "mount" not in cameras["left"]
+    assert cameras["left"]["intrinsics"] == "cam_left.yaml"
+    logged = {"file": "other", "topic": "/bravo/pose", "of": "body", "assumed": True}
+    assert cameras["IMG_4411"]["pose"] == logged
+    assert cameras["IMG_4411"]["mount"]["down_deg"] == 30
+    assert cameras["IMG_4411"]["intrinsics"] == {"file": "cam_right.yaml", "assumed": True}
 
 
 def test_videos_and_logs_of_different_hours_are_paired_by_time(tmp_path: Path) -> None:
