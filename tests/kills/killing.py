@@ -14,7 +14,7 @@ from tests.commands.runner import MOCAP, content, mocap, mocap_process
 from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 
 _ATTEMPTS, _QUICKER = 5, 0.7  # to hit a command before it ends
-_FRAMES = 40  # replaying takes a second at the least
+_FRAMES = 64  # a replay needs a second of joints that are ok
 _EXPORTED = "trc,c3d,bvh,csv,tum,mcap"
 SMALL_STUDY = (
     *("tilt_deg=0:60:15", "noise=medium", "method=dlt,robust"),
