@@ -41,7 +41,7 @@ import pandas as pd
 from benchmarks import attitudes, bodies, detectors, gimbals, people
 from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
-from benchmarks.results import fixed, keep, markdown_table
+from benchmarks.results import fixed, markdown_table, show
 from pipelines.detect import detect, follow
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
@@ -237,7 +237,7 @@ def _name_of(case: Case) -> str:
 
 
 def _files_hash(flight: Flight, detector: str) -> str:
-    files = [flight.scenario_path, flight.keypoints_path(detector), flight.tracks_path, flight.stills_path]
+    files = [flight.scenario_path, flight.keypoints_path(detector), *flight.background_paths]
     digest = sha256(detector.encode())
     for path in files:
         digest.update(path.read_bytes() if path.is_file() else b"-")
@@ -301,20 +301,20 @@ def _outcome(session: Path, took_s: float | None) -> Outcome:
     position = np.where(ok, skeleton[["x", "y", "z"]].to_numpy(np.float64).reshape(*shape, 3), np.nan)
     table = read_table(session / "truth.parquet", TRUTH)
     truth = true_joints_at(motion_from(table, joints), t_ns)[:, 0]
-    errors = measure(position[:, None], truth[:, None], joints, t_ns)
+    errors: Any = measure(position[:, None], truth[:, None], joints, t_ns)
     upper = skeleton[list(POINT_COVARIANCE_COLUMNS)].to_numpy(np.float64)
     covariance = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*shape, 3, 3)
     there = np.isfinite(position - truth).all(axis=-1)
     squared = nees(position[there] - truth[there], covariance[there])
     acceleration = errors["acceleration_error_mm_s2"]
     return Outcome(
-        _number(errors["mpjpe_mm"]),
-        _number(errors["root_mpjpe_mm"]),
-        None if acceleration is None else _number(acceleration) / 1e3,
+        errors["mpjpe_mm"],
+        errors["root_mpjpe_mm"],
+        None if acceleration is None else acceleration / 1e3,
         peak_ratio(position, truth, joints, t_ns),
         float(squared.mean()),
         float((squared <= _IN_95).mean()),
-        _number(errors["reconstructed_share"]),
+        errors["reconstructed_share"],
         took_s,
         **dict(_flexion_errors(session, t_ns, table)),
     )
@@ -332,10 +332,6 @@ def _flexion_errors(session: Path, t_ns: Any, truth: pd.DataFrame) -> Iterator[t
         yield f"{name}_deg", float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else None
 
 
-def _number(value: Any) -> float:
-    return float(value)
-
-
 def nees(error: Float, covariance: Float) -> Float:
     """Compute the squared error in units of its covariance [N], from [N, 3] and [N, 3, 3]."""
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
@@ -343,14 +339,7 @@ def nees(error: Float, covariance: Float) -> Float:
 
 
 def peak_ratio(position: Float, truth: Float, joints: Sequence[str], t_ns: Any) -> float | None:
-    """Compare the peak speeds of wrists and ankles with the true ones; None if all of them are slow.
-
-    Args:
-        position: [T, J, 3] m.
-        truth: [T, J, 3] m.
-        joints: the J names.
-        t_ns: [T] strictly increasing.
-    """
+    """Compare the peak speeds of wrists and ankles, [T, J, 3] m, with the true ones; None if all are slow."""
     ratios = []
     span_s = (t_ns[2:] - t_ns[:-2])[:, None] / 1e9
     for name in _WRISTS_AND_ANKLES:
@@ -464,9 +453,7 @@ def main() -> None:
         add(command)
     options = parser.parse_args()
     for key, lines in SUBJECTS[options.subject][1](options):
-        print("\n".join(["", *lines]), flush=True)
-        if options.write:
-            keep(key, lines)
+        show(key, lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from benchmarks.corpus.__main__ import film
 from benchmarks.corpus.stored import flights
 from benchmarks.results import markdown_table
 from pipelines.formats.videos.video import VideoReader
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Int64
 from pipelines.geometry.noise import Bias, GaussMarkov, NoiseModel, White, disturb, pose_errors
 from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rotation_vector_from_quaternion
 from pipelines.ingest import ingest
@@ -37,6 +37,8 @@ from pipelines.reconstruction.picture_map import (
     map_pictures,
 )
 from pipelines.session.description import read_description
+from pipelines.session.records import Trajectory
+from pipelines.session.tables import trajectory_from
 
 TUNED = ("01-walk", "06-turn", "07-jog", "15-two-people", "21-dance", "05-dance")
 KEPT = ("02-jog", "08-walk", "14-dance", "18-stand")
@@ -77,10 +79,8 @@ def measured(name: str, folder: Path, draws: int) -> Iterator[list[str]]:
     for camera, entry in read_description(session).cameras.items():
         frames = pd.read_parquet(session / "cameras" / camera / "frames.parquet")
         keys = frames.iloc[key_rows(frames["pts_ns"].to_numpy(np.int64))]
-        own = truth[truth["camera"] == camera]
-        t_ns, position = own["t_ns"].to_numpy(np.int64), own[["x", "y", "z"]].to_numpy(np.float64)
-        turned = own[["qx", "qy", "qz", "qw"]].to_numpy(np.float64)
-        row = [name, camera, f"{np.linalg.norm(position[-1] - position[0]):.1f}"]
+        own = trajectory_from(truth[truth["camera"] == camera])
+        row = [name, camera, f"{np.linalg.norm(own.position[-1] - own.position[0]):.1f}"]
         began_s, lens = time.process_time(), entry.intrinsics
         try:
             with VideoReader(place / f"{camera}.mp4") as pictures:
@@ -91,22 +91,16 @@ def measured(name: str, folder: Path, draws: int) -> Iterator[list[str]]:
             continue
         row += [f"{len(found.key)} of {len(keys)}", f"{time.process_time() - began_s:.0f}"]
         key_t_ns = keys["t_ns"].to_numpy(np.int64)
-        for models, step_s in LOGS.values():
-            row += _figures(found, key_t_ns, t_ns, position, turned, models, step_s, draws)
+        for log in LOGS.values():
+            row += _figures(found, key_t_ns, own, log, draws)
         yield row
 
 
 def _figures(
-    found: PictureMap,
-    key_t_ns: Int64,
-    t_ns: Int64,
-    position: Float,
-    turned: Float,
-    models: list[NoiseModel],
-    step_s: float,
-    draws: int,
+    found: PictureMap, key_t_ns: Int64, own: Trajectory, log: tuple[list[NoiseModel], float], draws: int
 ) -> list[str]:
     """Lay a map on places with errors drawn anew; return refusals, errors and NEES."""
+    (models, step_s), t_ns, position, turned = log, own.t_ns, own.position, own.quaternion_xyzw
     wide = {"max_gap_ns": 10**9, "max_extrapolation_ns": 10**9}
     true = interpolate_poses(t_ns, position, turned, key_t_ns[found.key], **wide)[1]
     step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)

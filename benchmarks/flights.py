@@ -23,10 +23,19 @@ def real_flight(folder: Path, calibration: str = "Calib_qualisys.toml", frame_ti
         video = REAL / "videos" / f"{name}.mp4"
         lines.append(f"  {name}: {{video: {video}, pose: {{file: {file}}}, intrinsics: {file}{times}}}")
     path = folder / "flight.yaml"
-    text = "\n".join(lines) + "\n"
-    if not path.exists() or path.read_text(encoding="utf-8") != text:
-        path.write_text(text, encoding="utf-8")
+    write_anew(path, "\n".join(lines))
     return path
+
+
+def write_anew(path: Path, text: str) -> None:
+    """Write a file unless it holds this text already, so that ingest finds it unchanged."""
+    if not holds(path, text):
+        path.write_text(text + "\n", encoding="utf-8")
+
+
+def holds(path: Path, text: str) -> bool:
+    """Test if a file holds a text and a line end."""
+    return path.exists() and path.read_text(encoding="utf-8") == text + "\n"
 
 
 def walker(x: float, y: float, heading_deg: float, *motion: dict[str, Any]) -> dict[str, Any]:

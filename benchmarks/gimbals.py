@@ -4,28 +4,18 @@ The real recording of Pose2Sim's demo has four still cameras (`MOCAP_REAL_DATA` 
 `pose2sim_single`; 100 pictures at 60 Hz). Each picture is undistorted and turned by a homography, as a gimbal
 would have turned the camera: it follows the person loosely, pans, tilts, rolls and shakes along a known path.
 Film, person, texture and detector are real. The path and the attitude errors in the log are not: they are
-drawn. Errors are about each axis of the camera, with the same standard deviation for the part that is
-constant and for the part that is new in every picture. Positions are exact.
+drawn, about each axis with the same standard deviation for the part that is constant and for the part that is
+new in every picture. Positions are exact.
 
-What this rests on:
+A path is known exactly. The constant part of attitude errors and all distances are as good as the calibration
+(`Calib_refit.toml`, refitted to keypoints of the same recording). There is no truth of the person: the
+reference is `robust` from the still cameras, with the same detector, and `NEES` takes it as exact. The rows
+without attitude errors are the floor. Jitter is the length of the second difference of a joint's path, over
+sqrt(3): that of white noise has the size of its frame-to-frame difference; the person's accelerations are in
+it. There is no parallax, and no blur beyond the recording's own.
 
-- A path is known exactly, and so is the changing part of an attitude error. Its constant part and every
-  distance are as good as the calibration (`Calib_refit.toml`, refitted to keypoints of the same recording;
-  the calibration that comes with it is 0.5 to 0.9 deg off for two cameras).
-- There is no truth of the person. The reference is the result of `robust` from the still cameras, with the
-  same detector and calibration. It has errors of its own, and shares part of the detector's with what is
-  compared to it. The rows without attitude errors are the floor.
-- `NEES` takes the distance as if the reference were exact (strict); `NEES both` adds its covariance (lenient:
-  errors that both share count as independent).
-- Jitter is the length of the second difference of a joint's path, over sqrt(3): that of white noise has the
-  size of its frame-to-frame difference. The person's own accelerations are in it; the floor says how much.
-- No parallax: positions never change. No blur beyond the recording's own. 1.7 s of one person.
-
-Paths a and b are for tuning; c and d are kept aside, and are measured with --kept only.
-
-Films, detections and sessions stay in FOLDER and are used again; methods are always measured anew.
-FOLDER/PATH/NAME.yaml are flights that every command of `mocap` takes, FOLDER/PATH/CAMERA.true.tum their true
-poses. Set OPENBLAS_NUM_THREADS=1.
+Paths a and b are for tuning; c and d are kept aside, and are measured with --kept only. Films, detections
+and sessions stay in FOLDER and are used again; methods are always measured anew.
 """
 
 import argparse
@@ -46,7 +36,7 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from benchmarks.flights import CAMERAS, PEER, REAL, real_flight
+from benchmarks.flights import CAMERAS, PEER, REAL, holds, real_flight, write_anew
 from benchmarks.results import fixed, markdown_table
 from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.geometry.arrays import Float, Intrinsics
@@ -102,9 +92,7 @@ class Figures:
     jitter_mm: float
     changing_deg: float
     constant_deg: float
-    roll_deg: float  # of it about the optical axis
     nees: float
-    nees_both: float
     share_percent: float
     cpu_s: float
 
@@ -155,11 +143,11 @@ def prepare_path(folder: Path, detector: str, logs: Sequence[Log], path: str) ->
     for log in (Log(0.0), *logs):
         write_flight(place, log, path, shots)
     for name, shot in shots.items():
-        if not _holds(place / f"{name}.shot", repr(shot)):
+        if not holds(place / f"{name}.shot", repr(shot)):
             _film(name, shot, attitudes(path, name, shot), place / f"{name}.mp4")
             for sessions in place.glob("*/"):  # they hold keypoints of the film before
                 shutil.rmtree(sessions)
-            _write(place / f"{name}.shot", repr(shot))
+            write_anew(place / f"{name}.shot", repr(shot))
     session = _session(place, detector, Log(0.0))
     ingest(place / "true.yaml", session)
     reconstruct(session, ReconstructSettings(method="robust", detector=detector))
@@ -217,7 +205,7 @@ def write_flight(place: Path, log: Log, path: str, shots: dict[str, Shot]) -> No
             ]
         )
         file = f"{name}.{log.name}.tum"
-        _write(place / file, "\n".join(" ".join(f"{value:.9f}" for value in row) for row in rows))
+        write_anew(place / file, "\n".join(" ".join(f"{value:.9f}" for value in row) for row in rows))
         fx, fy, cx, cy = _virtual_lens(shot)
         noise = f"rotation_deg: {log.level_deg:g}"
         for given, own in lines.items():
@@ -231,9 +219,9 @@ def write_flight(place: Path, log: Log, path: str, shots: dict[str, Shot]) -> No
             ]
             if given and log.level_deg:
                 own.append(f"    pose_noise: {{white: {{{noise}}}, bias: {{{noise}}}}}")
-    _write(place / f"{log.name}.yaml", "\n".join(lines[False]))
+    write_anew(place / f"{log.name}.yaml", "\n".join(lines[False]))
     if log.level_deg:
-        _write(place / f"{log.name}-given.yaml", "\n".join(lines[True]))
+        write_anew(place / f"{log.name}-given.yaml", "\n".join(lines[True]))
 
 
 def _virtual_lens(shot: Shot) -> tuple[float, float, float, float]:
@@ -261,16 +249,6 @@ def _film(name: str, shot: Shot, world_from_virtual: Float, out: Path) -> None:
             film.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         film.mux(stream.encode(None))
     unfinished.replace(out)
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file unless it holds this text already, so that ingest finds it unchanged."""
-    if not _holds(path, text):
-        path.write_text(text + "\n", encoding="utf-8")
-
-
-def _holds(path: Path, text: str) -> bool:
-    return path.exists() and path.read_text(encoding="utf-8") == text + "\n"
 
 
 def _session(place: Path, detector: str, log: Log, *, given: bool = False) -> Path:
@@ -304,45 +282,37 @@ def measured(
 
 def _figures(session: Path, reference: pd.DataFrame, true: dict[str, Float], taken_s: float) -> Figures:
     table = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
-    ours, theirs = (_of_person(skeleton) for skeleton in (table, reference))
-    apart = ours.position - theirs.position
+    (ours, covariance), (theirs, _) = (_of_person(skeleton) for skeleton in (table, reference))
+    apart = ours - theirs
     both = np.isfinite(apart).all(axis=-1)
-    second = np.diff(ours.position, 2, axis=0)
-    changing, constant, roll = _attitude_errors_deg(session, true)
+    second = np.diff(ours, 2, axis=0)
+    changing, constant = _attitude_errors_deg(session, true)
     return Figures(
         distance_mm=1e3 * float(np.median(np.linalg.norm(apart[both], axis=-1))),
         jitter_mm=1e3 * float(np.nanmedian(np.linalg.norm(second, axis=-1))) / np.sqrt(3),
         changing_deg=changing,
         constant_deg=constant,
-        roll_deg=roll,
-        nees=_nees(apart[both], ours.covariance[both]),
-        nees_both=_nees(apart[both], ours.covariance[both] + theirs.covariance[both]),
-        share_percent=100 * float(both.sum() / np.isfinite(theirs.position).all(axis=-1).sum()),
+        nees=_nees(apart[both], covariance[both]),
+        share_percent=100 * float(both.sum() / np.isfinite(theirs).all(axis=-1).sum()),
         cpu_s=taken_s,
     )
 
 
-@dataclass(frozen=True)
-class _Person:
-    position: Float  # [T, J, 3] m
-    covariance: Float  # [T, J, 3, 3] m^2
-
-
-def _of_person(skeleton: pd.DataFrame) -> _Person:
-    """Shape a dense table, sorted by time, person and joint; the only person is 0."""
+def _of_person(skeleton: pd.DataFrame) -> tuple[Float, Float]:
+    """Shape a dense table: positions [T, J, 3] m of the only person, and covariances [T, J, 3, 3] m^2."""
     own = skeleton[skeleton["person"] == 0]
     shape = (own["t_ns"].nunique(), -1)
     c = own[list(POINT_COVARIANCE_COLUMNS)].to_numpy(float)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
-    return _Person(own[["x", "y", "z"]].to_numpy(float).reshape(*shape, 3), c.reshape(*shape, 3, 3))
+    return own[["x", "y", "z"]].to_numpy(float).reshape(*shape, 3), c.reshape(*shape, 3, 3)
 
 
 def _nees(apart: Float, covariance: Float) -> float:
     return float(np.mean(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(covariance), apart)))
 
 
-def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float, float]:
+def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float]:
     """Compute the changing and the constant part of the attitude errors: RMS per axis over the cameras."""
-    changing, constant, roll = [], [], []
+    changing, constant = [], []
     own = session / "reconstruct" / "cameras.parquet"
     estimated = pd.read_parquet(own) if own.exists() else pd.DataFrame({"camera": []})
     for name, attitude in true.items():
@@ -355,8 +325,7 @@ def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, 
         error = min(errors, key=lambda each: float(each.var(axis=0).sum()))
         changing.append(error - error.mean(axis=0))
         constant.append(error.mean(axis=0))
-        roll.append(errors[0].mean(axis=0)[2])
-    return _rms(changing), _rms(constant), _rms(roll)
+    return _rms(changing), _rms(constant)
 
 
 def _rms(values: Any) -> float:

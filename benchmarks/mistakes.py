@@ -18,7 +18,6 @@ With --corpus, the flights are those of `benchmarks.corpus`. They are checked as
 in the times of all pictures, which backgrounds alone can show. `--write` puts the counts into the results.
 """
 
-import argparse
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
@@ -32,7 +31,7 @@ from ruamel.yaml import YAML
 
 from benchmarks.corpus.drawn import DrawnFlight, Given, kept_in_place_of_pictures
 from benchmarks.corpus.stored import DETECTORS, HALVES, Flight, Half, flights
-from benchmarks.results import fixed, keep, markdown_table
+from benchmarks.results import fixed, markdown_table, parser_of, show
 from pipelines.check import check
 from pipelines.detect import detect, follow
 from pipelines.ingest import ingest
@@ -250,9 +249,7 @@ def _doubted(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "mocap_mistakes")
     parser.add_argument("--kept", action="store_true", help="the flights that were kept aside")
     parser.add_argument("--less-usual", action="store_true", help="make less usual mistakes instead")
@@ -261,7 +258,6 @@ def main() -> None:
     parser.add_argument("--expected", type=int, metavar="N", help="check the expected errors of N flights")
     parser.add_argument("--seed", type=int, default=100, help="the first of the right flights")
     parser.add_argument("--corpus", choices=HALVES, help="check the flights of the corpus instead")
-    parser.add_argument("--write", action="store_true", help="put the counts into docs/results.md")
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
     if options.right:
@@ -276,9 +272,7 @@ def main() -> None:
         key = "mistakes-kept" if options.kept else "mistakes-tuned"
         chosen = {"kept": options.kept, "rare": options.less_usual}
         lines = described(options.folder, options.flights, options.mistake, **chosen)
-    print("\n".join(["", *lines]))
-    if options.write:
-        keep(key, lines)
+    show(key, lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -45,35 +45,25 @@ WITHIN_M = 0.5
 DETECTED_M = 0.25
 JOG = {"distance_m": 14, "speed_mps": 2.4}
 
-
-def standing(x: float, y: float, heading_deg: float = 0.0) -> dict[str, Any]:
-    """Return a person of a scenario who stands."""
-    return walker(x, y, heading_deg, {"stand": {"seconds": 6}})
-
-
 SCENES: dict[str, dict[str, dict[str, Any]]] = {
     "two cross": {"anna": walker(-3, 0, 0), "ben": walker(0.3, -3, 90)},
     "two hug": {
         "anna": walker(-2, 0, 0, {"walk": {"distance_m": 1.7, "speed_mps": 1.0}}, {"stand": {"seconds": 4}}),
         "ben": walker(2, 0, 180, {"walk": {"distance_m": 1.8, "speed_mps": 1.0}}, {"stand": {"seconds": 4}}),
     },
-    "two run past": {
-        "anna": walker(-6, 0, 0, {"jog": JOG}),
-        "ben": walker(6, 0.5, 180, {"jog": JOG}),
-    },
+    "two run past": {"anna": walker(-6, 0, 0, {"jog": JOG}), "ben": walker(6, 0.5, 180, {"jog": JOG})},
     "one leaves": {
         "anna": walker(0, 0, 0, {"walk": {"distance_m": 5, "speed_mps": 0.8}}),
         "ben": walker(3, 2, 60, {"jog": {"distance_m": 20, "speed_mps": 3.0, "turn_deg": 330}}),
     },
-    "three meet": {
-        "anna": walker(-3, 0, 0),
-        "ben": walker(2, -3, 120),
-        "cleo": walker(2, 3, 240),
-    },
+    "three meet": {"anna": walker(-3, 0, 0), "ben": walker(2, -3, 120), "cleo": walker(2, 3, 240)},
     "crowd behind": {
         "anna": walker(-3, 0, 0),
         "ben": walker(3, 1, 180),
-        **{f"crowd{k}": standing(-4 + 2.0 * k, 7 + 0.4 * (k % 2), 270) for k in range(5)},
+        **{
+            f"crowd{k}": walker(-4 + 2.0 * k, 7 + 0.4 * (k % 2), 270, {"stand": {"seconds": 6}})
+            for k in range(5)
+        },
     },
 }
 
@@ -99,6 +89,7 @@ def modelled_table(scenes: list[str], seeds: list[int]) -> list[str]:
     rows = []
     for scene in scenes:
         people = SCENES[scene]
+        alone = float(np.mean([alone_mm(people, seed) for seed in seeds]))
         for logs in ("all", "none"):
             own = [measured(people, seed, logs == "all") for seed in seeds]
             total = {key: sum(row[key] for row in own) for key in _SUMS}
@@ -109,7 +100,7 @@ def modelled_table(scenes: list[str], seeds: list[int]) -> list[str]:
                     *(str(total[key]) for key in ("switches", "phantoms")),
                     fixed(float(np.mean([row["idf1"] for row in own])), 3),
                     fixed(float(np.mean([row["mpjpe_mm"] for row in own]))),
-                    fixed(float(np.mean([alone_mm(people, seed) for seed in seeds]))),
+                    fixed(alone),
                 ]
             )
     header = ["scene", "logs", "found", "coverage %", "switches", "phantoms", "IDF1", "MPJPE"]
@@ -138,14 +129,9 @@ def filmed_table(scenes: list[str], folder: Path, seeds: list[int]) -> list[str]
 _SUMS = ("covered", "seen", "switches", "phantoms")
 
 
-@cache
-def _alone(first: str, seed: int) -> float:
-    return float(measured(json.loads(first), seed, logs=True)["mpjpe_mm"])
-
-
 def alone_mm(people: dict[str, dict[str, Any]], seed: int) -> float:
     """Return the MPJPE (mm) of the first person in a flight of their own."""
-    return _alone(json.dumps(dict([next(iter(people.items()))])), seed)
+    return float(measured(dict([next(iter(people.items()))]), seed, logs=True)["mpjpe_mm"])
 
 
 def measured(people: dict[str, dict[str, Any]], seed: int, logs: bool) -> dict[str, Any]:

@@ -12,11 +12,10 @@ tuned on; those from 2000 on are kept aside.
 prediction: one posture of a walk, carried along by the actor, is measured by triangulation with modelled
 keypoints and white pose noise (0.02 m, 0.2 deg). The ray model predicts the error from the same noise.
 
-filming: the scenes of Hughes et al. 2024, four robots on a grid of 1 m, eight headings, 4 to 6 people who
-move. Their planners' solutions are scored with `view_quality`, frame by frame. Then every scene is planned
-from the same starts by the planner of the arm `group`, under the same limits. They are no logs of a flight:
-robots jump from cell to cell. groups: four drones, people who stand together, walk apart, and come back.
-`first` is `adaptive` with the weight of all others 0.
+filming: the scenes of Hughes et al. 2024, four robots that jump from cell to cell of a grid of 1 m, 4 to 6
+people who move. Their planners' solutions are scored with `view_quality`, frame by frame, and so are plans of
+the arm `group` from the same starts, under the same limits. groups: `first` is `adaptive` with the weight of
+all others 0.
 """
 
 import argparse
@@ -24,7 +23,7 @@ import csv
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.flights import REAL_DATA, scenario_of, walker
-from benchmarks.results import fixed, keep, markdown_table
+from benchmarks.results import fixed, markdown_table, parser_of, show
 from pipelines.formats.common.files import read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import White
@@ -134,14 +133,7 @@ def predict(seed: int) -> dict[str, Predicted]:
     found = {}
     for arm, (name, changes) in FLOWN.items():
         config = PlannerConfig(tuning=PlannerTuning(errors=errors), **changes)
-        done = replay(
-            PLANNER_ARMS.get(name),
-            world.actor_t_ns,
-            world.actor,
-            [field],
-            start,
-            config=config,
-        )
+        done = replay(PLANNER_ARMS.get(name), world.actor_t_ns, world.actor, [field], start, config=config)
         joints, place, actor = done.actor[rows, None] + posture, done.position[:, rows], done.actor[rows]
         measured = measure(
             CameraPaths(
@@ -399,22 +391,16 @@ SUBJECTS: dict[str, tuple[Callable[[argparse.Namespace], Lines], str]] = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main() -> None:
+    parser = parser_of(__doc__)
     parser.add_argument("subject", choices=SUBJECTS)
     parser.add_argument("--first", type=int, help="seed of the first world")
     parser.add_argument("--count", type=int, help="worlds")
     parser.add_argument("--seeds", type=int, nargs="+")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     function, key = SUBJECTS[options.subject]
-    lines = function(options)
-    print("\n".join(lines))
-    if options.write:
-        keep(key, lines)
+    show(key, function(options), write=options.write)
 
 
 if __name__ == "__main__":

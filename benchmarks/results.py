@@ -24,6 +24,7 @@ from textwrap import wrap
 from typing import Any
 
 from pipelines.reporting.studies import tables
+from pipelines.session.storage import read_json
 
 ROOT = Path(__file__).parents[1]
 PAGE, STORE = ROOT / "docs" / "results.md", ROOT / "docs" / "results.json"
@@ -75,6 +76,8 @@ SECTIONS = (
         (
             Part("gimbals-kept", "Cameras that turn", REAL, KEPT),
             Part("gimbals-tuned", "Cameras that turn", REAL, TUNED),
+            Part("attitudes-kept", "Attitudes from pictures", RENDERED, KEPT),
+            Part("attitudes-tuned", "Attitudes from pictures", RENDERED, TUNED),
             Part("detectors", "Detectors, and the distance from Pose2Sim's skeleton", REAL, ""),
         ),
     ),
@@ -131,7 +134,6 @@ SECTIONS = (
             Part("speed", "Speed, and peers", "measured", ""),
             Part("scale", "Long flights: memory and time", MODELLED, ""),
             Part("scale-accuracy", "Flights of 90 s: errors", MODELLED, ""),
-            Part("scale-batch", "Batches with one worker and with two", MODELLED, ""),
         ),
     ),
 )
@@ -147,7 +149,7 @@ def keep(key: str, lines: Sequence[str], command: str | None = None) -> None:
     done = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S603
     module = sys.modules["__main__"].__spec__
     name = module.name.removesuffix(".__main__") if module else "benchmarks"
-    stored = read_store()
+    stored = read_json(STORE)
     stored[key] = {
         "command": command or shlex.join(["python", "-m", name, *sys.argv[1:]]),
         "date": datetime.now(UTC).date().isoformat(),
@@ -158,10 +160,18 @@ def keep(key: str, lines: Sequence[str], command: str | None = None) -> None:
     PAGE.write_text(page_of(stored), encoding="utf-8")
 
 
-def read_store() -> dict[str, dict[str, Any]]:
-    """Read the parts that were measured."""
-    stored: dict[str, dict[str, Any]] = json.loads(STORE.read_text(encoding="utf-8"))
-    return stored
+def parser_of(words: str | None) -> argparse.ArgumentParser:
+    """Make the parser of a benchmark whose docstring is its help; `--write` keeps its table."""
+    parser = argparse.ArgumentParser(description=words, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
+    return parser
+
+
+def show(key: str, lines: Sequence[str], *, write: bool) -> None:
+    """Print a table, and keep it if asked."""
+    print("\n".join(["", *lines]), flush=True)
+    if write:
+        keep(key, lines)
 
 
 def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
@@ -252,11 +262,6 @@ def _run(command: str) -> None:
         raise SystemExit(f"{command}\n{done.stderr}")
 
 
-def _metrics(path: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
-
-
 def measure_poses() -> None:
     """Reconstruct the sample from true and from logged poses."""
     rows = []
@@ -264,7 +269,7 @@ def measure_poses() -> None:
         session = PLACE / f"poses{number}.session"
         _run(f"mocap ingest {SAMPLE}/{manifest}.yaml -o {session}")
         _run(f"mocap reconstruct {session} {options}")
-        found = _metrics(session / "reconstruct" / "metrics.json")
+        found = read_json(session / "reconstruct" / "metrics.json")
         shares = [100 * found[key] for key in POSE_FIGURES[3:]]
         rows.append([name, *(fixed(v, 1) for v in [*(found[key] for key in POSE_FIGURES[:3]), *shares])])
     header = ["poses", "MPJPE", "root-relative", "PA", "PCK@150 mm %", "measured %"]
@@ -292,7 +297,7 @@ def measure_arms() -> None:
             session = _simulated(name)
             options = "--arms adaptive,fixed --config sample_data/planning/planner.yaml"
         _run(f"mocap replan-compare {session} {options} --trials 5")
-        for arm, scores in _metrics(session / "replan" / "metrics.json")["arms"].items():
+        for arm, scores in read_json(session / "replan" / "metrics.json")["arms"].items():
             error = scores["reconstruction_error"]
             rows.append(
                 [
@@ -315,7 +320,7 @@ def measure_filmed() -> None:
     for name, (scenario, options) in FILMED.items():
         session = _simulated(scenario)
         _run(f"mocap replan-compare {session} {options} --trials 2")
-        for arm, scores in _metrics(session / "film" / "metrics.json")["arms"].items():
+        for arm, scores in read_json(session / "film" / "metrics.json")["arms"].items():
             tilt = scores["tilt_deg"]
             rows.append(
                 [
@@ -336,7 +341,7 @@ def measure_studies() -> None:
     for key, command in STUDIES.items():
         _run(command.replace("FOLDER", str(PLACE / key)))
         lines: list[str] = []
-        for table in tables(_metrics(PLACE / key / "metrics.json")):
+        for table in tables(read_json(PLACE / key / "metrics.json")):
             if table.title.startswith(("MPJPE, ", "Root-relative MPJPE")):
                 rows = [[row[0], *(cell.partition(" [")[0] for cell in row[2:])] for row in table.rows]
                 header = [f"noise; {table.title}", *table.header[2:]]
@@ -361,7 +366,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="check that the page is up to date")
     options = parser.parse_args()
     if options.check:
-        sys.exit(0 if PAGE.read_text(encoding="utf-8") == page_of(read_store()) else f"{PAGE}: is old")
+        sys.exit(0 if PAGE.read_text(encoding="utf-8") == page_of(read_json(STORE)) else f"{PAGE}: is old")
     if not options.page:
         if not options.only:
             shutil.rmtree(PLACE, ignore_errors=True)
@@ -369,7 +374,7 @@ def main() -> None:
         for name, measure in MEASURES.items():
             if options.only in (None, name):
                 measure()
-    PAGE.write_text(page_of(read_store()), encoding="utf-8")
+    PAGE.write_text(page_of(read_json(STORE)), encoding="utf-8")
     print(f"written: {PAGE}")
 
 

@@ -1,19 +1,16 @@
-"""Long flights and many flights: errors, memory and time of the commands.
+"""Long flights: errors, memory and time of the commands.
 
     python -m benchmarks.scale [--minutes 2 10]        # memory and processor time of each command
     python -m benchmarks.scale --accuracy [--count 8]  # `auto` beside `robust` on flights of 90 s
-    python -m benchmarks.scale --batch [--flights 8]   # one worker and two
 
 Everything is simulated, with modelled keypoints and no film. Each command of --minutes has a process of its
 own.
 """
 
-import argparse
 import json
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,12 +18,10 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 from benchmarks.flights import SAMPLE
-from benchmarks.results import fixed, keep, markdown_table
-from pipelines.batch import BatchSettings, batch
+from benchmarks.results import fixed, markdown_table, parser_of, show
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.simulate import simulate
-from tests.synthetic.flights import write_flight
 
 _CONSTANT = {
     "white": {"position_m": 0.02, "rotation_deg": 0.2},
@@ -104,51 +99,22 @@ def accuracy(seed: int) -> Iterator[list[str]]:
             ]
 
 
-def batches(count: int, seconds: float = 4.0) -> Iterator[list[str]]:
-    """Ingest and reconstruct small flights with one worker and with two; the best of three counts."""
-    settings = BatchSettings(("ingest", "reconstruct"), ReconstructSettings("robust"))
-    with tempfile.TemporaryDirectory(prefix="scale-") as folder:
-        place = Path(folder)
-        manifests = [
-            write_flight(place / f"flight{k}", seconds=seconds, cameras=3, seed=k).manifest
-            for k in range(count)
-        ]
-        for workers in (1, 2):
-            took_s = []
-            for turn in range(3):
-                started = time.perf_counter()
-                assert not batch(manifests, place / f"out{turn}-{workers}", settings, workers=workers).failed
-                took_s.append(time.perf_counter() - started)
-            yield [f"{count} of {seconds:g} s", str(workers), fixed(min(took_s), 1)]
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--minutes", type=float, nargs="+", default=[2.0, 10.0])
     parser.add_argument("--accuracy", action="store_true", help="errors of flights of 90 s instead")
     parser.add_argument("--first", type=int, default=300, help="seed of the first flight of --accuracy")
     parser.add_argument("--count", type=int, default=8, help="flights of --accuracy")
-    parser.add_argument("--batch", action="store_true", help="time batches instead")
-    parser.add_argument("--flights", type=int, default=8, help="of --batch")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
     options = parser.parse_args()
     if options.accuracy:
         key, header = "scale-accuracy", ["flight", "noise stated", "robust", "auto"]
         header += ["root-relative, robust", "root-relative, auto"]
         seeds = range(options.first, options.first + options.count)
         rows = [row for seed in seeds for row in accuracy(seed)]
-    elif options.batch:
-        key, header = "scale-batch", ["flights", "workers", "s"]
-        rows = list(batches(options.flights))
     else:
         key, header = "scale", ["minutes", "command", "peak MB", "CPU s"]
         rows = [row for minutes in options.minutes for row in commands(minutes)]
-    lines = markdown_table(header, rows)
-    print("\n".join(lines))
-    if options.write:
-        keep(key, lines)
+    show(key, markdown_table(header, rows), write=options.write)
 
 
 if __name__ == "__main__":

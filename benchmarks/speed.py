@@ -5,7 +5,7 @@ row says otherwise. Peers run here, but for those of `refined`, which were measu
 another machine (2,250 frames of the same kind of walk, five cameras, true poses).
 
     triangulation  22,500 frames of 17 joints in five cameras, 2 px; also 5 % gross errors and missing views
-    association    five people among each other in five cameras, 900 frames
+    association    five people among each other in five cameras, 450 frames
     refinement     75 s of five cameras, 17 joints, 30 Hz
     logs           a recorder's log of 200 MB: rosbags iterates over raw messages, we ingest
     planner        a central plan of the seed's size and of the largest; 75 s of flight; a map of 25 M voxels
@@ -13,7 +13,6 @@ another machine (2,250 frames of the same kind of walk, five cameras, true poses
     sample         the commands on the sample flight, with detection in all pictures
 """
 
-import argparse
 import json
 import os
 import resource
@@ -33,13 +32,10 @@ import pycolmap
 import yaml  # type: ignore[import-untyped]
 
 from benchmarks.flights import SAMPLE
-from benchmarks.results import keep, markdown_table
-from pipelines.geometry.arrays import Float, Int64, Intrinsics
-from pipelines.geometry.cameras import undistort
+from benchmarks.results import markdown_table, parser_of, show
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import pose_errors
-from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, estimate_noise, triangulate
-from pipelines.keypoints.association import associate
 from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import distance_field
@@ -49,14 +45,11 @@ from pipelines.planning.replay import Start, replay
 from pipelines.reconstruction.refinement.refine import refine
 from pipelines.session.records import Occupancy
 from pipelines.simulate import simulate
-from pipelines.simulation.detector_errors import see
-from pipelines.simulation.flying import orbit
 from tests.geometry.rings import FOCAL, ring, with_outliers, with_pixel_noise
+from tests.keypoints.test_association import film, straight
 from tests.planning.worlds import mound, walker
 from tests.reconstruction.formations import BONES, formation, mean_mm
 from tests.synthetic import recorder_logs
-from tests.synthetic.keypoints import KeypointNoise, detect
-from tests.synthetic.walk import walk
 
 Row = tuple[str, str, str]
 """Timed operation: its name, its speed, its error or its peer."""
@@ -79,22 +72,21 @@ def triangulation() -> Iterator[Row]:
     """Time triangulation, and numpy and pycolmap on fewer joint-frames."""
     rng = np.random.default_rng(1)
     truth, exact = ring(22_500, 5)
-    noisy = with_pixel_noise(exact, rng)
-    outliers, _ = with_outliers(noisy, rng, uniform=False)
-    few = slice(0, 17 * 450)
-    for name, views in (("2 px", noisy), ("outliers", outliers)):
+    few_truth, few_exact = ring(450, 5)
+    noisy, few = (with_pixel_noise(views, rng) for views in (exact, few_exact))
+    bad, few_bad = (with_outliers(views, rng, uniform=False)[0] for views in (noisy, few))
+    for name, views, own in (("2 px", noisy, few), ("outliers", bad, few_bad)):
         seen = replace(views, pixel_sigma=estimate_noise(views))
         for method in ("midpoint", "robust"):
             points = triangulate(seen, method=method).points
             took_s = best_s(lambda: triangulate(seen, method=method))  # noqa: B023
             yield _points_row(f"triangulation, {method}, {name}", took_s, points, truth)
-        own = _part(views, few)
         peers = {"pycolmap LO-RANSAC": pycolmap_ransac}
         if name == "2 px":
             peers["numpy batched SVD"] = numpy_svd
         for peer, run in peers.items():
             yield _points_row(
-                f"the same by {peer}, {name}", best_s(partial(run, own), 1), run(own), truth[few]
+                f"the same by {peer}, {name}", best_s(partial(run, own), 1), run(own), few_truth
             )
 
 
@@ -136,90 +128,19 @@ def pycolmap_ransac(views: Views) -> Float:
     return points
 
 
-def _part(views: Views, rows: slice) -> Views:
-    """Select some joint-frames and their poses."""
-    instants = slice(0, int(views.pose_index[rows].max()) + 1)
-    return replace(
-        views,
-        rays=views.rays[rows],
-        weight=views.weight[rows],
-        pose_index=views.pose_index[rows],
-        position=views.position[instants],
-        rotation=views.rotation[instants],
-        pose_sigma=views.pose_sigma[instants],
-    )
-
-
 # --- several people --------------------------------------------------------------------------------------
 
-_PEOPLE, _FRAMES, _PIXEL_PX = 5, 900, 3.0
-_LENS = Intrinsics(1920, 1080, 1000.0, 1000.0, 959.5, 539.5)
+_PEOPLE, _SECONDS = 5, 30.0
 
 
 def association() -> Iterator[Row]:
-    """Time the association of five people, and their triangulation."""
-    t_s = np.arange(_FRAMES) / 30
-    people = np.stack(
-        [
-            walk(
-                t_s,
-                start=(2.5 * np.cos(k), 2.5 * np.sin(k)),
-                heading_deg=70.0 * k,
-                radius_m=2.0 + 0.4 * k,
-            )
-            for k in range(_PEOPLE)
-        ],
-        axis=1,
-    )
-    xy, confidence, position, rotation = _filmed(people, t_s)
-    sigma = np.full((_FRAMES, _PEOPLE), _PIXEL_PX / _LENS.fx)
-    found: list[Int64] = []
-
-    def choose() -> None:
-        result = associate(t_s, xy, confidence, position, rotation, sigma, people=_PEOPLE)
-        found[:] = [result.choice]
-
-    choose()
-    took_ms = 1e3 * best_s(choose, 3) / _FRAMES
-    yield "association, five people in five cameras", f"{took_ms:.2f} ms/frame", ""
-    views = _views_of(found[0], xy, confidence, position, rotation)
-    took_ms = 1e3 * best_s(lambda: triangulate(views, method="robust"), 3) / _FRAMES
-    yield "their triangulation", f"{took_ms:.2f} ms/frame", "RapidPoseTriangulation claims 1 ms"
-
-
-def _filmed(people: Float, t_s: Float) -> tuple[Float, Float, Float, Float]:
-    """Simulate detections in a random order, and the poses of the cameras, as `associate` takes them."""
-    rng = np.random.default_rng(0)
-    middle = np.tile([0.0, 0.0, 1.0], (len(t_s), 1))
-    position, quaternion = orbit(t_s, middle, cameras=_PEOPLE, range_m=14, variation=1)
-    xy = np.full((len(t_s), _PEOPLE, _PEOPLE, 17, 2), np.nan)
-    confidence = np.zeros(xy.shape[:-1])
-    for c in range(_PEOPLE):
-        order = rng.permuted(np.tile(np.arange(_PEOPLE), (len(t_s), 1)), axis=1)
-        for k in range(_PEOPLE):
-            seen = see(people[:, k], position[c], quaternion[c], _LENS)
-            pixels, sure = detect(seen, KeypointNoise(pixel_px=_PIXEL_PX), rng)
-            rows, places = np.nonzero(order == k)
-            xy[rows, c, places], confidence[rows, c, places] = undistort(pixels, _LENS), sure
-    rotation = matrix_from_quaternion(quaternion)
-    return xy, confidence, position.swapaxes(0, 1).copy(), rotation.swapaxes(0, 1).copy()
-
-
-def _views_of(choice: Int64, xy: Float, confidence: Float, position: Float, rotation: Float) -> Views:
-    """Collect the chosen views of each person, one row for each joint-frame."""
-    chosen, absent = np.clip(choice, 0, None)[:, :, :, None], (choice < 0)[:, :, :, None]
-    taken = np.where(absent[..., None], np.nan, np.take_along_axis(xy, chosen[..., None], axis=2))
-    weight = np.where(absent, 0.0, np.take_along_axis(confidence, chosen, axis=2))
-    return Views(
-        rays=np.moveaxis(taken, 1, 3).reshape(-1, _PEOPLE, 2),
-        weight=np.moveaxis(weight, 1, 3).reshape(-1, _PEOPLE),
-        pose_index=np.repeat(np.arange(_FRAMES), _PEOPLE * 17),
-        position=position,
-        rotation=rotation,
-        focal=np.full(_PEOPLE, _LENS.fx),
-        pixel_sigma=np.full(_PEOPLE, _PIXEL_PX),
-        pose_sigma=np.zeros((_FRAMES, _PEOPLE, 2)),
-    )
+    """Time the association of five people."""
+    paths = [straight((3 * np.cos(k), 3 * np.sin(k)), (-0.2 * np.cos(k), -0.1)) for k in range(_PEOPLE)]
+    scene = film(paths, seconds=_SECONDS, cameras=_PEOPLE)
+    scene.associate(_PEOPLE)  # the first compiles
+    took_ms = 1e3 * best_s(lambda: scene.associate(_PEOPLE), 3) / len(scene.time_s)
+    said = "RapidPoseTriangulation claims 1 ms, triangulation included"
+    yield "association, five people in five cameras", f"{took_ms:.2f} ms/frame", said
 
 
 # --- refinement ------------------------------------------------------------------------------------------
@@ -373,11 +294,8 @@ SUBJECTS: dict[str, Callable[[], Iterator[Row]]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--only", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
-    parser.add_argument("--write", action="store_true", help="put the table into docs/results.md")
     options = parser.parse_args()
     rows = []
     for name in options.only:
@@ -385,10 +303,8 @@ def main() -> None:
             print(json.dumps(row), file=sys.stderr, flush=True)
             rows.append(list(row))
     lines = markdown_table(["what", "speed", "result, or compared with"], rows)
-    print("\n".join(lines))
-    if options.write:
-        load = f"Load of the machine: {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores."
-        keep("speed", [*lines, "", load])
+    load = f"Load of the machine: {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores."
+    show("speed", [*lines, "", load], write=options.write)
 
 
 if __name__ == "__main__":

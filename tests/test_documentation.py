@@ -114,7 +114,7 @@ def _parse_benchmark(module: str, words: list[str]) -> None:
     """Parse by the benchmark's own parser; one without a parser takes no arguments."""
     path = _ROOT / f"{module.replace('.', '/')}.py"
     assert path.is_file(), module
-    if "ArgumentParser(" not in path.read_text(encoding="utf-8"):
+    if "parse_args()" not in path.read_text(encoding="utf-8"):
         assert not words, (module, words)
         return
     parse = argparse.ArgumentParser.parse_args

@@ -1,10 +1,10 @@
 """Make the corpus: film, detect with both networks, follow the background, and keep what that gives.
 
-    python -m benchmarks.corpus [--films FOLDER] [--workers N] [--refollow] [--keep-films] [FLIGHT ...]
+    python -m benchmarks.corpus [--films FOLDER] [--workers N] [--refollow] [FLIGHT ...]
 
 What exists is kept, so an interrupted run goes on. `--refollow` follows the backgrounds anew, with the films
-that are in the folder. A film is removed once all of its flight is kept, unless `--keep-films`. The detectors
-must be there (`mocap models fetch`), and the recorded motions (MOCAP_REAL_DATA).
+that are in the folder. A film is removed once all of its flight is kept. The detectors must be there
+(`mocap models fetch`), and the recorded motions (MOCAP_REAL_DATA).
 """
 
 import argparse
@@ -38,7 +38,6 @@ def main() -> None:
     parser.add_argument("--films", type=Path, default=Path("build/corpus_films"))
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--refollow", action="store_true", help="follow the backgrounds anew")
-    parser.add_argument("--keep-films", action="store_true")
     arguments = parser.parse_args()
     for flight in flights():
         if arguments.flights and flight.name not in arguments.flights:
@@ -47,15 +46,14 @@ def main() -> None:
         if make(flight, arguments.films, arguments.workers, again=arguments.refollow):
             took, cpu = time.perf_counter() - began, time.process_time() - spent
             print(f"{flight.name}: {took:.0f} s, {cpu:.0f} s of the processor", flush=True)
-        if not arguments.keep_films:
-            for path in arguments.films.glob(f"{flight.name}*"):
-                shutil.rmtree(path)
+        for path in arguments.films.glob(f"{flight.name}*"):
+            shutil.rmtree(path)
 
 
 def make(flight: Flight, films: Path, workers: int = 1, *, again: bool = False) -> bool:
     """Make what is missing of a flight; return False if nothing is."""
     missing = [name for name in DETECTORS if not flight.keypoints_path(name).is_file()]
-    follows = flight.with_pictures and (again or not flight.tracks_path.is_file())
+    follows = flight.with_pictures and (again or not flight.background_paths[0].is_file())
     if not missing and not follows:
         return False
     flight.folder.mkdir(parents=True, exist_ok=True)

@@ -141,15 +141,10 @@ class DrawnFlight:
     def session(
         self, place: Path, draw: int, given: Given, detector: str, *, poses: Poses = "logged"
     ) -> Path:
-        """Write the files of one draw, ingest them, and return the session.
+        """Write the files of one draw into a new folder, ingest them, and return the session.
 
-        Args:
-            place: a folder for these files and the session.
-            draw: the number of the draw.
-            given: what flight.yaml and the logs give of the poses' errors.
-            detector: the keypoints of a flight without pictures.
-            poses: those that the manifest names; `shared` ones are the true ones, moved and turned together
-                by the error that all cameras of this draw share.
+        Poses that are `shared` are the true ones, moved and turned together by the error that all cameras of
+        this draw share. The detector's keypoints are those of a flight without pictures.
         """
         place.mkdir(parents=True)
         for path in self.folder.iterdir():

@@ -75,14 +75,9 @@ class Flight:
         return self.folder / f"{detector}.parquet"
 
     @property
-    def tracks_path(self) -> Path:
-        """The file of the background's tracks."""
-        return self.folder / "background.parquet"
-
-    @property
-    def stills_path(self) -> Path:
-        """The file of the stills."""
-        return self.folder / "stills.parquet"
+    def background_paths(self) -> tuple[Path, Path]:
+        """The files of the background's tracks and of its stills."""
+        return self.folder / "background.parquet", self.folder / "stills.parquet"
 
 
 def flights(halves: Sequence[Half] = HALVES) -> list[Flight]:
@@ -185,14 +180,16 @@ def write_backgrounds(flight: Flight, backgrounds: Mapping[str, Background]) -> 
         tracks.append(pd.DataFrame(rounded).sort_values(["point", "frame"]))
         kept = background.stills
         stills.append(pd.DataFrame({"camera": camera, "frame": list(kept), "jpeg": list(kept.values())}))
-    _write(flight.stills_path, pd.concat(stills), _STILLS, {})
-    _write(flight.tracks_path, pd.concat(tracks), _SIGHTINGS, {})
+    for path, parts, schema in zip(
+        flight.background_paths, (tracks, stills), (_SIGHTINGS, _STILLS), strict=True
+    ):
+        _write(path, pd.concat(parts), schema, {})
 
 
 def read_backgrounds(flight: Flight) -> dict[str, Background]:
     """Read the tracks in the order in which the follower writes them, and the stills."""
-    tracks = pq.read_table(flight.tracks_path).to_pandas().sort_values(["frame", "point"])
-    stills = pq.read_table(flight.stills_path).to_pandas()
+    tracks, stills = (pq.read_table(path).to_pandas() for path in flight.background_paths)
+    tracks = tracks.sort_values(["frame", "point"])
     backgrounds = {}
     for camera, rows in tracks.groupby("camera", observed=True):
         table = pd.DataFrame({name: rows[name].to_numpy(np.int64) for name in ("frame", "point")})
