@@ -181,12 +181,8 @@ class OnnxNetwork:
         shape = given.shape
         nchw = len(shape) == 4 and (shape[1] == 3 or not isinstance(shape[1], int))
         if more or len(shape) != 4 or given.type not in _TYPES or not (nchw or shape[3] == 3):
-            raise DataError(
-                path,
-                f"its input is {given.type} {_written(shape)}",
-                "it must be one picture of floats, [N,3,H,W] or [N,H,W,3]",
-                code="wrong-model",
-            )
+            remedy = "it must be one picture of floats, [N,3,H,W] or [N,H,W,3]"
+            raise DataError(path, f"its input is {given.type} {_written(shape)}", remedy, code="wrong-model")
         self._input, self._type = given.name, _TYPES[given.type]
         # A graph that leaves both axes open is what the exporters of PyTorch write, channels first.
         self._nchw = nchw and not (shape[3] == 3 and shape[1] != 3)
@@ -589,12 +585,9 @@ class OnnxDetector:
 def _joints(path: Path, count: int, stated: str | None) -> tuple[str, ...]:
     known = skeleton_with(count) if stated is None else (get_skeleton(stated),)
     if not known or len(known[0].joints) > count:
-        raise DataError(
-            path,
-            f"has {count} joints, which {'no known skeleton' if stated is None else stated} has not",
-            "state whose come first: skeleton=coco17 for COCO-WholeBody, skeleton=halpe26 for Halpe",
-            code="bad-option",
-        )
+        problem = f"has {count} joints, which {'no known skeleton' if stated is None else stated} has not"
+        remedy = "state whose come first: skeleton=coco17 for COCO-WholeBody, skeleton=halpe26 for Halpe"
+        raise DataError(path, problem, remedy, code="bad-option")
     return known[0].joints
 
 

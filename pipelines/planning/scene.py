@@ -290,21 +290,15 @@ def _actor(
             hips[np.searchsorted(t_ns, person.t_ns), k] = person.hips
         return *_measured(folder, t_ns, hips, "the actor's log"), "log"
     if reconstructed is None:
-        raise DataError(
-            folder,
-            "has no logged actor and no reconstruction to take one from",
-            "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml",
-            code="no-actor",
-        )
+        problem = "has no logged actor and no reconstruction to take one from"
+        remedy = "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml"
+        raise DataError(folder, problem, remedy, code="no-actor")
     found = _reconstruction(folder)
     middle = _hips_of(found)
     if middle is None or not np.isfinite(middle[:, 0]).any():
-        raise DataError(
-            folder,
-            "has no logged actor, and the reconstruction has no time at which both hips are ok",
-            "name the actor's topic under `actor:` in flight.yaml, or mend the reconstruction",
-            code="no-actor",
-        )
+        problem = "has no logged actor, and the reconstruction has no time at which both hips are ok"
+        remedy = "name the actor's topic under `actor:` in flight.yaml, or mend the reconstruction"
+        raise DataError(folder, problem, remedy, code="no-actor")
     known = np.isfinite(middle[..., 0])
     filmed = known[known[:, 0]].mean(axis=0) >= MIN_SHARE_OF_TIMES
     return *_measured(folder, found.t_ns, middle[:, filmed], "the reconstruction's hips"), "reconstruction"
@@ -327,13 +321,11 @@ def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.in
     kept = (t_ns >= first_ns) & (t_ns <= last_ns)
     shared_s = float(np.ptp(t_ns[kept]) / 1e9) if kept.any() else 0.0
     if shared_s < MIN_FLIGHT_S:
-        raise DataError(
-            folder,
+        problem = (
             f"{', '.join(['the actor', *spans])} are known together for {shared_s:.2f} s, less than"
-            f" {MIN_FLIGHT_S:g} s",
-            "check the clocks of the logs",
-            code="no-overlap",
+            f" {MIN_FLIGHT_S:g} s"
         )
+        raise DataError(folder, problem, "check the clocks of the logs", code="no-overlap")
     return t_ns[kept], actor[kept]
 
 

@@ -694,9 +694,6 @@ def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
         ours |= {name for each in stated or () for name in each.get("files", ())}
     foreign = sorted({path.name for path in folder.iterdir()} - ours)
     if foreign:
-        raise DataError(
-            folder,
-            f"holds other files than figures ({len(foreign)}, the first {foreign[0]})",
-            "name another folder with --figures, or replace it with --overwrite",
-            code="exists",
-        )
+        problem = f"holds other files than figures ({len(foreign)}, the first {foreign[0]})"
+        remedy = "name another folder with --figures, or replace it with --overwrite"
+        raise DataError(folder, problem, remedy, code="exists")

@@ -425,12 +425,8 @@ def _drone(
 
     frames_ns = frame_times(lens_spec, scenario.duration_s, np.random.default_rng([seed, _FRAMES, index]))
     if not len(frames_ns):
-        raise DataError(
-            "duration_s",
-            f"{name} takes no picture within {scenario.duration_s:g} s at {lens_spec.rate_hz:g} Hz",
-            "film longer, or more often",
-            code="no-pictures",
-        )
+        problem = f"{name} takes no picture within {scenario.duration_s:g} s at {lens_spec.rate_hz:g} Hz"
+        raise DataError("duration_s", problem, "film longer, or more often", code="no-pictures")
     at_log = sample_log(paths, index, drones.odometry_hz, span_s, np.random.default_rng([seed, _LOG, index]))
     offsets = drones.clock_offsets_s
     return SimulatedDrone(

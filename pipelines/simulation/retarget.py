@@ -73,11 +73,9 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
         if not missing and not _hangs_on(source, found[f"{side}_{below}"], found[f"{side}_{above}"])
     ]
     if missing:
-        raise DataError(
-            "skeleton",
-            f"found no {', '.join(missing)} among its bones {', '.join(source.bones)}",
-            "name them as usual (LeftUpLeg, LeftLeg, LeftFoot, LeftArm, LeftForeArm, ...)",
-        )
+        problem = f"found no {', '.join(missing)} among its bones {', '.join(source.bones)}"
+        remedy = "name them as usual (LeftUpLeg, LeftLeg, LeftFoot, LeftArm, LeftForeArm, ...)"
+        raise DataError("skeleton", problem, remedy)
     _trunk(source, found)
     for side in SIDES:
         found.setdefault(f"{side}_clavicle", found["chest"])
