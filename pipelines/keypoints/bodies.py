@@ -260,10 +260,7 @@ def _continuity(time_s: Float, points: Float, size: Float, piece: Int64, nodes: 
             continue
         middle = median_of(points[t, c, d], axis=1)
         rates, known = [], []
-        for begin, end in (
-            (np.maximum(first, last - trend), last),
-            (first, np.minimum(last, first + trend)),
-        ):
+        for begin, end in ((np.maximum(first, last - trend), last), (first, np.minimum(last, first + trend))):
             span_s = time_s[t[end]] - time_s[t[begin]]
             known.append(span_s > 0)
             rates.append((middle[end] - middle[begin]) / np.where(span_s > 0, span_s, 1.0)[:, None])

@@ -268,10 +268,7 @@ def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
 
 def _lattice_of(states: Float, config: PlannerConfig) -> Lattice:
     return lattice(
-        states,
-        rates=np.array(config.slot_rates),
-        knot_s=config.tuning.knot_s,
-        w_turn=config.tuning.w_turn,
+        states, rates=np.array(config.slot_rates), knot_s=config.tuning.knot_s, w_turn=config.tuning.w_turn
     )
 
 
@@ -455,9 +452,7 @@ class _GroupPlanner(_TeamPlanner):
         way = np.linalg.norm(view.position - place, axis=-1)
         most_m = config.speed_mps**2 / config.acceleration_mps2
         takes_s = np.where(
-            way < most_m,
-            2.0 * np.sqrt(way / config.acceleration_mps2),
-            (way + most_m) / config.speed_mps,
+            way < most_m, 2.0 * np.sqrt(way / config.acceleration_mps2), (way + most_m) / config.speed_mps
         )
         there = takes_s <= config.tuning.knot_s * np.arange(1, len(way) + 1)[:, None]
         return view._replace(

@@ -180,11 +180,7 @@ def _scores(
         "simulated": name not in LOGGED,
         "drones": len(flown.position),
         "safety": flown.safety or None,
-        "reconstruction_error": {
-            "simulated": True,
-            **figures,
-            "joint_frames": result.joint_frames,
-        },
+        "reconstruction_error": {"simulated": True, **figures, "joint_frames": result.joint_frames},
         **_by_person(scene, result, seen, shared),
     }
 

@@ -22,14 +22,7 @@ from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, Grid, interpolate
 from pipelines.planning.forecast import ActorFilter, PeopleFilter
-from pipelines.planning.local import (
-    POSITION,
-    VELOCITY,
-    DronePlan,
-    flying_of,
-    roll_out,
-    stopping_ticks,
-)
+from pipelines.planning.local import POSITION, VELOCITY, DronePlan, flying_of, roll_out, stopping_ticks
 
 # At 8 m/s a drone flies 0.4 m between two checks; every half voxel is checked as well.
 CHECK_PERIOD_S = 0.05

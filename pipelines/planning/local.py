@@ -25,13 +25,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import (
-    DIAGONAL,
-    DistanceField,
-    Grid,
-    interpolate,
-    nearest,
-)
+from pipelines.planning.distance_field import DIAGONAL, DistanceField, Grid, interpolate, nearest
 
 # --- tracking of a plan ---
 

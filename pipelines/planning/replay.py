@@ -21,22 +21,9 @@ from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, ra
 from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.planning.arms import Arm, RollingOut
 from pipelines.planning.config import MOST_DRONES, PlannerConfig
-from pipelines.planning.distance_field import (
-    DistanceField,
-    MapsInTurn,
-    looked,
-    open_space,
-    visible,
-)
+from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, open_space, visible
 from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter, positions_at
-from pipelines.planning.formation import (
-    TILT,
-    YAW,
-    FormationPath,
-    formation_slots,
-    slot_of,
-    slot_offsets,
-)
+from pipelines.planning.formation import TILT, YAW, FormationPath, formation_slots, slot_of, slot_offsets
 from pipelines.planning.guard import FlownMotion, Guard
 from pipelines.planning.local import DronePlan, LocalPlanner, tracking_times
 from pipelines.planning.scene import ReplayScene, planned_positions
@@ -96,12 +83,7 @@ class Pilot:
     """
 
     def __init__(
-        self,
-        arm: Arm,
-        config: PlannerConfig,
-        start: Start,
-        *,
-        weights: Sequence[float] = (1.0,),
+        self, arm: Arm, config: PlannerConfig, start: Start, *, weights: Sequence[float] = (1.0,)
     ) -> None:
         if not 1 <= start.drones <= MOST_DRONES:
             raise ValueError(f"{start.drones} drones: 1 to {MOST_DRONES} can be planned for")
@@ -451,10 +433,7 @@ def trajectories(scene: ReplayScene, flown: ArmFlight) -> pd.DataFrame:
     seen = seen_people(scene, flown)
     error = errors_of_views(flown.position, scene.people, seen, scene.config).mean(axis=0)
     table = pd.DataFrame(
-        {
-            "t_ns": np.repeat(scene.t_ns, count),
-            "camera": np.tile(np.array(flown.names, dtype=object), times),
-        }
+        {"t_ns": np.repeat(scene.t_ns, count), "camera": np.tile(np.array(flown.names, dtype=object), times)}
     )
     table[_POSITION] = position
     table[_QUATERNION] = _rows(flown.quaternion_xyzw)

@@ -22,12 +22,7 @@ from pipelines.planning.distance_field import (
     in_turn,
 )
 from pipelines.planning.forecast import positions_at
-from pipelines.planning.formation import (
-    YAW,
-    formation_slots,
-    slot_of,
-    slot_offsets,
-)
+from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets
 from pipelines.planning.local import tracking_times
 from pipelines.session.camera_poses import COMMAND_LINE, known_variances, poses_at, stated_models
 from pipelines.session.description import HIP_ABOVE_POINT_M, CameraEntry, Description, Interpolation
@@ -120,11 +115,7 @@ class LoggedFlight:
 
 
 def load_flight(
-    folder: Path,
-    description: Description,
-    reconstructed: StageRecord | None,
-    *,
-    pose_noise: str | None,
+    folder: Path, description: Description, reconstructed: StageRecord | None, *, pose_noise: str | None
 ) -> LoggedFlight:
     """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
@@ -270,10 +261,7 @@ def _hips(skeleton: JointMotion) -> JointMotion | None:
 
 
 def _actor(
-    folder: Path,
-    description: Description,
-    reconstructed: StageRecord | None,
-    warnings: list[str],
+    folder: Path, description: Description, reconstructed: StageRecord | None, warnings: list[str]
 ) -> tuple[Int64, Float, Source]:
     """Return the planners' input, [A] and [A, P, 3]: the logs of the people, or the reconstructed hips."""
     logged = logged_people(folder, description)

@@ -9,12 +9,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.planning.config import ErrorModel, PlannerConfig
-from pipelines.planning.distance_field import (
-    DistanceField,
-    MapsInTurn,
-    looked,
-    visible,
-)
+from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, visible
 from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
 
 Scores = dict[str, object]
@@ -123,11 +118,7 @@ def hidden_by_people(camera: Float, target: Float, people: Float) -> Bool:
 
 
 def sights(
-    camera: Float,
-    looks_rad: Float,
-    people: Float,
-    maps: DistanceField | MapsInTurn,
-    config: PlannerConfig,
+    camera: Float, looks_rad: Float, people: Float, maps: DistanceField | MapsInTurn, config: PlannerConfig
 ) -> Bool:
     """Test [P, N, T] which cameras [N, T, 3] see which people [P, T, 3] (the middle of the hips).
 

@@ -67,12 +67,7 @@ def fit_bodies(observations: Observations, views: Views, result: Triangulation) 
 
 
 def _errors(
-    landmarks: Landmarks,
-    views: Views,
-    result: Triangulation,
-    first_row: Index,
-    columns: Index,
-    times: Index,
+    landmarks: Landmarks, views: Views, result: Triangulation, first_row: Index, columns: Index, times: Index
 ) -> tuple[Float, Float]:
     """Divide the covariances of landmarks into their own and a common one, see `body_fit.fit_body`.
 

@@ -110,11 +110,7 @@ class FoundClocks:
         }
         if self.wrong:
             found["clocks_moved"] = {
-                name: {
-                    "offset_s": offset_s[name],
-                    "sigma_s": found["clock_offset_sigmas_s"][name],
-                    "by": by,
-                }
+                name: {"offset_s": offset_s[name], "sigma_s": found["clock_offset_sigmas_s"][name], "by": by}
                 for name, by in self.wrong.items()
             }
         return found

@@ -20,14 +20,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import project, row_delay_s, undistort
-from pipelines.geometry.noise import (
-    EXACT,
-    ROTATION,
-    SHIFT_IN_WORLD,
-    USUAL_CONSTANT,
-    USUAL_COUNT,
-    Process,
-)
+from pipelines.geometry.noise import EXACT, ROTATION, SHIFT_IN_WORLD, USUAL_CONSTANT, USUAL_COUNT, Process
 from pipelines.geometry.poses import cross_matrix, multiply, quaternion_from_rotation_vector
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks, people_boxes
 from pipelines.reconstruction.observations import Camera

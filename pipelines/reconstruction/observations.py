@@ -214,11 +214,7 @@ def _poses_at(cameras: list[Camera], t_ns: Int64, between: Interpolation) -> tup
 
 
 def observe(
-    cameras: list[Camera],
-    found: Candidates,
-    choice: Int64,
-    t_ns: Int64,
-    between: Interpolation,
+    cameras: list[Camera], found: Candidates, choice: Int64, t_ns: Int64, between: Interpolation
 ) -> Observations:
     """Interpolate the chosen people's keypoints and the cameras' poses to the common times.
 

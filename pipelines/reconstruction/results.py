@@ -162,12 +162,7 @@ def of_people(
 
 
 def _intervals(
-    position: Float,
-    own: Float | None,
-    status: Int8,
-    residual: Float,
-    joints: tuple[str, ...],
-    t_ns: Int64,
+    position: Float, own: Float | None, status: Int8, residual: Float, joints: tuple[str, ...], t_ns: Int64
 ) -> dict[str, Any]:
     """Compute confidence intervals of the means over the flight by block bootstrap (`geometry.metrics`)."""
     whole: dict[str, Series] = {}

@@ -127,11 +127,7 @@ def draw_paths(
         marks.append(line_through(path, colour, label, width=2.0))
         marks.append(points_at(path[np.isfinite(path[:, 0])][:1], colour, filled=False, size=5))
     panel = Panel(
-        marks,
-        axis_label("east", origin[0]),
-        axis_label("north", origin[1]),
-        grid="both",
-        equal=True,
+        marks, axis_label("east", origin[0]), axis_label("north", origin[1]), grid="both", equal=True
     )
     height = float(np.clip(0.75 * WIDTH_IN * extent[1] / extent[0], 3.2, 6.2))
     caption = (

@@ -123,11 +123,7 @@ def make_scene(
 
 
 def _notes(
-    every: int,
-    times: int,
-    body: _PackedBody | None,
-    around: RaisedSurface | None,
-    strips: Sequence[Strip],
+    every: int, times: int, body: _PackedBody | None, around: RaisedSurface | None, strips: Sequence[Strip]
 ) -> list[str]:
     """List differences from the tables, in whole sentences."""
     notes = []

@@ -202,10 +202,6 @@ def environment() -> Environment:
         keep_trailing_newline=True,
     )
     made.filters.update(
-        fixed=fixed,
-        whole=whole,
-        percent=percent,
-        kind_of=lambda it: type(it).__name__,
-        markup=Markup,
+        fixed=fixed, whole=whole, percent=percent, kind_of=lambda it: type(it).__name__, markup=Markup
     )
     return made

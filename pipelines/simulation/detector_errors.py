@@ -49,10 +49,7 @@ _CONFIDENCE_RANGE, _CONFIDENCE_NOISE, _OUTLIER_DOUBT = 0.14, 0.05, 0.3
 MEDIAN_PER_SIGMA = float(np.sqrt(2 * np.log(2)))
 """Median length of a keypoint's error over the standard deviation of a coordinate (Rayleigh)."""
 
-_LIMBS = (
-    ("elbow", "wrist", "pinky", "index", "thumb"),
-    ("knee", "ankle", "heel", "big_toe", "small_toe"),
-)
+_LIMBS = (("elbow", "wrist", "pinky", "index", "thumb"), ("knee", "ankle", "heel", "big_toe", "small_toe"))
 
 
 # --- the table -----------------------------------------------------------------------------------------

@@ -398,14 +398,7 @@ def _paths(
         return fly(slots, hip, t_s, drones.limits)
     start = slots[:, 0]
     return fly_with(
-        planner(world),
-        start,
-        hip,
-        t_s,
-        drones.limits,
-        actor_t_s=actor_s,
-        actor=actor,
-        rate_hz=_PLANNER_HZ,
+        planner(world), start, hip, t_s, drones.limits, actor_t_s=actor_s, actor=actor, rate_hz=_PLANNER_HZ
     )
 
 

@@ -266,12 +266,7 @@ def _from_neutral(bone: Float) -> Float:
 
 
 def pelvis_height(
-    rig: Rig,
-    place: Float,
-    pelvis: Float,
-    feet: Sequence[Foot],
-    wanted_m: Float,
-    softness_m: Float,
+    rig: Rig, place: Float, pelvis: Float, feet: Sequence[Foot], wanted_m: Float, softness_m: Float
 ) -> Float:
     """Return the wanted height [T] m, or what the carrying legs allow with their least knee flexion.
 
@@ -446,13 +441,7 @@ def _trunk(plan: Plan, style: Style, swing: Swing, t_s: Float, yaw: Float, pelvi
 
 
 def _arms(
-    rig: Rig,
-    plan: Plan,
-    swing: Swing,
-    t_s: Float,
-    root: Float,
-    bones: dict[str, Float],
-    floor: Float,
+    rig: Rig, plan: Plan, swing: Swing, t_s: Float, root: Float, bones: dict[str, Float], floor: Float
 ) -> None:
     """Add clavicles, arms and hands to `bones`: hanging, swinging, or reaching for a height."""
     keys = plan.keys

@@ -12,12 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    Field,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from pipelines.geometry.arrays import COEFFICIENT_COUNTS, Intrinsics
 from pipelines.session.yaml_files import read_yaml_model

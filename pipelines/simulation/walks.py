@@ -149,12 +149,7 @@ def _smoothed(at: Callable[[Float], BodyMotion], t_s: Float) -> Float:
 def formation(of: Walk, *, cameras: int, tilt_deg: float) -> CameraFormation:
     """Place cameras in their slots: 360/n degrees apart, 90 for two, `RANGE_M` from the person."""
     position, quaternion = orbit(
-        of.t_ns / 1e9,
-        of.aim,
-        cameras=cameras,
-        range_m=RANGE_M,
-        tilt_deg=tilt_deg,
-        yaw_rate_deg_per_s=0.0,
+        of.t_ns / 1e9, of.aim, cameras=cameras, range_m=RANGE_M, tilt_deg=tilt_deg, yaw_rate_deg_per_s=0.0
     )
     return CameraFormation(position, quaternion, of.lens)
 
@@ -319,17 +314,7 @@ LEVELS = {"none": (0.0, 0.0), "low": (0.1, 0.5), "medium": (0.3, 1.0), "high": (
 
 # Levels of the noise in Ho et al., Sim E1 and E2, in which `auto` may be left out for speed.
 _USUAL = {"method": METHODS, "keypoints": ("model",), "seconds": ("75",), "trials": ("10",), "seed": ("0",)}
-KNOWN = (
-    "tilt_deg",
-    "robots",
-    "noise",
-    "method",
-    "keypoints",
-    "seconds",
-    "rate_hz",
-    "trials",
-    "seed",
-)
+KNOWN = ("tilt_deg", "robots", "noise", "method", "keypoints", "seconds", "rate_hz", "trials", "seed")
 """Variables of a study of a walk."""
 
 # The refinement falls back to `robust` with fewer pictures, so that its row would be that of `robust`.

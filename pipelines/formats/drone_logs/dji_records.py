@@ -166,12 +166,7 @@ class _Record:
         t_ns, timed = self.times
         placed = {"latitude": np.where(self.placed, self.columns["latitude"], np.nan)}
         return DjiRows(
-            t_ns,
-            timed,
-            {**self.columns, **placed},
-            self.clock,
-            zero_is_none=True,
-            dropped=self.dropped,
+            t_ns, timed, {**self.columns, **placed}, self.clock, zero_is_none=True, dropped=self.dropped
         )
 
     @property

@@ -174,12 +174,7 @@ class Fit:
     covariance: Float  # [n, n] of the numbers: what the constant errors leave of it; without, of all errors
 
 
-def fit(
-    flight: Sampled,
-    make: Make,
-    start: Float | None = None,
-    loose: Sequence[float] = (),
-) -> Fit:
+def fit(flight: Sampled, make: Make, start: Float | None = None, loose: Sequence[float] = ()) -> Fit:
     """Fit the numbers of an alternative, and the constant errors of all poses, by Gauss-Newton.
 
     Args:

@@ -25,13 +25,7 @@ from pipelines.reconstruction.refinement.elimination import (
     eliminate,
     shared_covariance,
 )
-from pipelines.reconstruction.refinement.estimate import (
-    BOUND,
-    BOUNDS,
-    initial_state,
-    learn,
-    solve,
-)
+from pipelines.reconstruction.refinement.estimate import BOUND, BOUNDS, initial_state, learn, solve
 from pipelines.reconstruction.refinement.kernels import State, turned
 from pipelines.reconstruction.refinement.system import (
     REMEMBERED,
@@ -453,10 +447,7 @@ def _priors(
 
 
 def _known_prior(
-    problem: Problem,
-    start: Float,
-    prior: Sequence[PoseErrors],
-    clock_sigma_s: Float,
+    problem: Problem, start: Float, prior: Sequence[PoseErrors], clock_sigma_s: Float
 ) -> Iterator[_Prior]:
     """Yield the prior with known pose errors; motion, bones and keypoint noise are learned beside them.
 

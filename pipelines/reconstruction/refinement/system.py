@@ -179,11 +179,7 @@ class Sighting:
         return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.rays[..., 0]).all(axis=1)
 
 
-def build(
-    t_s: Float,
-    sightings: Sequence[Sighting],
-    bones: Int64,
-) -> Problem:
+def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
     """Build the problem: sort pictures by the skeleton's times around them; leave out those near none.
 
     Args:
