@@ -1,7 +1,8 @@
 """Bodies fitted to the skeletons of rendered flights: `python -m benchmarks.accuracy bodies`.
 
 The flights are those of `corpus`, first draw, with the true noise model given. Shape and rotations of the
-people are known. "Landmarks" are the skeleton's shoulders, elbows, hips, knees and ankles against the true
+people are known. Each camera is also one by itself, without a stated stature. "Landmarks" are the skeleton's
+shoulders, elbows, hips, knees and ankles against the true
 joint centres, "centres" those of the body; both relative to the middle of the hips. NEES is that of vertices,
 by the covariances in body.parquet.
 """
@@ -13,6 +14,7 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
+from ruamel.yaml import YAML
 
 from benchmarks.corpus.drawn import DrawnFlight, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import HALVES, Flight, flights
@@ -21,6 +23,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.body_model import body_model
 from pipelines.geometry.poses import cross_matrix, interpolate_poses
 from pipelines.geometry.rig import BONE, BONES
+from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.people import take_joints
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, MovingBody
@@ -38,6 +41,7 @@ CASES: dict[str, tuple[str, Poses, str]] = {
     "default network, logged poses, `auto`": ("blazepose", "logged", "auto"),
     "heavy network, true poses, `robust`": ("blazepose-heavy", "true", "robust"),
 }
+ONE_CAMERA = "one camera, default network, logged poses"
 CENTRES = {
     f"{side}_{joint}": BONE[f"{side}_{bone}"]
     for side in ("left", "right")
@@ -82,7 +86,7 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
             print(flight.name, case, *(f"{value:.1f}" for value in astuple(errors)), flush=True)
     rows = []
     for half in HALVES:
-        for case in CASES:
+        for case in (*CASES, ONE_CAMERA):
             if own := found.get((half, case)):
                 table = np.array([astuple(errors) for errors in own])
                 mean, middle = table.mean(axis=0), np.median(table, axis=0)
@@ -106,6 +110,16 @@ def measured(flight: Flight) -> Iterator[tuple[str, BodyErrors]]:
                 reconstruct(session, ReconstructSettings(method=method, detector=detector))  # type: ignore[arg-type]
             for errors in errors_of(session):
                 yield case, errors
+        logged = Path(folder) / "0"
+        manifest = YAML(typ="safe").load(logged / "flight.yaml")
+        for drone, entry in manifest["cameras"].items():
+            truth = manifest["truth"] | {"poses": {drone: manifest["truth"]["poses"][drone]}}
+            YAML().dump(manifest | {"cameras": {drone: entry}, "truth": truth}, logged / f"{drone}.yaml")
+            session = ingest(logged / f"{drone}.yaml", logged / f"only_{drone}").folder
+            with kept_in_place_of_pictures(flight, "blazepose"):
+                reconstruct(session, ReconstructSettings())
+            for errors in errors_of(session):
+                yield ONE_CAMERA, errors
 
 
 def errors_of(session: Path) -> Iterator[BodyErrors]:

@@ -49,6 +49,8 @@ from pipelines.session.storage import (
 from pipelines.session.tables import (
     ACTOR,
     ANGLES,
+    BODY,
+    BODY_SHAPE,
     CAMERA_POSES,
     FRAMES,
     JOINT_ERRORS,
@@ -69,7 +71,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-REPORT = Stage("report", revision=17)
+REPORT = Stage("report", revision=18)
 # Figures of another revision are drawn again.
 _FIGURES_REVISION = 8
 
@@ -401,6 +403,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
     found_by |= {name: "detect" for name in detected if name not in found_by}
     outputs = records["reconstruct"].outputs if reconstructed else {}
     angles, errors = "reconstruct/angles.parquet", "reconstruct/joint_errors.parquet"
+    bodies, shapes = "reconstruct/body.parquet", "reconstruct/body_shape.parquet"
     maps = load_maps(folder) if description.map else []
     return SessionContent(
         name=session_name(folder),
@@ -417,6 +420,8 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         refined=_by_camera(shown, "reconstruct/cameras.parquet", records.get("reconstruct")),
         angles=shown.table(angles, ANGLES) if angles in outputs else None,
         joint_errors=read_table(folder / errors, JOINT_ERRORS) if errors in outputs else None,
+        bodies=shown.table(bodies, BODY) if bodies in outputs else None,
+        shapes=read_table(folder / shapes, BODY_SHAPE) if shapes in outputs else None,
         made_by=versions_of(folder),
         outdated=tuple(outdated(records, description.recorded)),
     )

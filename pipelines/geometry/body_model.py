@@ -147,6 +147,19 @@ class BodyModel:
         skinning = Skinning(joint, self.neutral_from_rest, steps)
         return self.skin(shape).moved(*skinning.transforms(root, rotation))
 
+    def simplified(self, cell: float) -> tuple[Index, Index]:
+        """Choose vertices [V'] about a cell apart, of a stature of 1, and the triangles [F, 3] between them.
+
+        Vertices of one cell and one bone become the first of them (Rossignac and Borrel 1993).
+        """
+        key = np.column_stack([np.floor(self.vertex[0] / cell), self.weights.argmax(axis=1)])
+        _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        corners = group.ravel()[np.concatenate([self.quads[:, [0, 1, 2]], self.quads[:, [0, 2, 3]]])]
+        ordered = np.sort(corners, axis=1)
+        _, once = np.unique(ordered, axis=0, return_index=True)
+        whole = np.asarray((np.diff(ordered, axis=1) > 0).all(axis=1))
+        return first, corners[np.sort(once[whole[once]])]
+
     def reach(self, bones: Index, offset: Float) -> Float:
         """Express points that are fixed to bones as vectors of every bone.
 

@@ -63,6 +63,8 @@ class SessionContent:
     angles: pd.DataFrame | None = None  # tables.ANGLES, where the reconstruction has them
     joint_errors: pd.DataFrame | None = None  # tables.JOINT_ERRORS, likewise
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
+    bodies: pd.DataFrame | None = None  # tables.BODY, where bodies were fitted
+    shapes: pd.DataFrame | None = None  # tables.BODY_SHAPE, likewise
     every: int = 1  # times of the skeleton of which one was loaded, with what was recorded about it
 
 
@@ -74,6 +76,7 @@ class Strip:
     t_ns: Int64  # [N]
     pictures: tuple[str, ...]  # [N] WebP in base64
     joints: Float  # [N, P, K, 2] part of the picture's side from its upper left corner; NaN if missing
+    projection: Float  # [N, 3, 4] homogeneous, to such parts from the world (m), exact near the person
 
 
 def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:

@@ -31,6 +31,7 @@ from pipelines.reporting.summary import (
 )
 from pipelines.reporting.viewer import make_scene
 from pipelines.reporting.wording import Column, Table, environment
+from pipelines.session.tables import moving_bodies
 
 
 def _template(name: str, **context: object) -> Markup:
@@ -51,7 +52,9 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
     figures = {figure.key: figure for figure in _draw(summary, content, replan)}
     measured = as_reconstructed(content)
     strips = make_strips(measured, summary, read_frame, video)
-    scene = make_scene(summary, content.poses | content.refined, replan, strips)
+    fitted = content.bodies, content.shapes
+    bodies = [] if fitted[0] is None or fitted[1] is None else moving_bodies(fitted[0], fitted[1])
+    scene = make_scene(summary, content.poses | content.refined, replan, strips, bodies)
     overlays = _overlays(measured, summary, read_frame)
     started = wording.moment(summary.origin_ns)
 

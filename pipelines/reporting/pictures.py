@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64, Picture
+from pipelines.geometry.cameras import project, undistort
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.chart import INK, WIDTH_IN, Figure, Image, Mark, Panel, points_at
 from pipelines.reporting.content import MeasuredMotion, SessionContent, Strip, side_of
@@ -458,20 +459,21 @@ def _strip(
     if not len(rows):
         return None
     tried = rows[np.linspace(0, len(rows) - 1, TRIED_PICTURES + 2).astype(np.int64)[1:-1]]
-    sizes = [len(each) for _, each, _ in _cut(camera, tried, motion, origin_ns, read_frame, video)]
+    sizes = [len(each) for _, each, *_ in _cut(camera, tried, motion, origin_ns, read_frame, video)]
     if not sizes:
         return None
     seconds = (camera.frame_t_ns[rows[-1]] - camera.frame_t_ns[rows[0]]) / 1e9
     most = int(min(0.75 * budget / max(sizes), MAX_STRIP_HZ * seconds + 1, len(rows)))
     chosen = rows[np.unique(np.linspace(0, len(rows) - 1, max(most, 1)).round().astype(np.int64))]
     cut = _cut(camera, chosen, motion, origin_ns, read_frame, video)
-    while sum(len(each) for _, each, _ in cut) > 0.75 * budget and len(cut) > 1:  # base64 adds a third
+    while sum(len(each) for _, each, *_ in cut) > 0.75 * budget and len(cut) > 1:  # base64 adds a third
         cut = cut[::2]
     return Strip(
         camera=camera.name,
-        t_ns=np.array([camera.frame_t_ns[row] for row, _, _ in cut], dtype=np.int64),
-        pictures=tuple(base64.b64encode(each).decode("ascii") for _, each, _ in cut),
-        joints=np.stack([joints for *_, joints in cut]),
+        t_ns=np.array([camera.frame_t_ns[row] for row, *_ in cut], dtype=np.int64),
+        pictures=tuple(base64.b64encode(each).decode("ascii") for _, each, *_ in cut),
+        joints=np.stack([joints for _, _, joints, _ in cut]),
+        projection=np.stack([projection for *_, projection in cut]),
     )
 
 
@@ -482,8 +484,8 @@ def _cut(
     origin_ns: int,
     read_frame: ReadFrame,
     video: Video,
-) -> list[tuple[int, bytes, Float]]:
-    """Cut out and encode the pictures of frames that have any: row, WebP, joints."""
+) -> list[tuple[int, bytes, Float, Float]]:
+    """Cut out and encode the pictures of frames that have any: row, WebP, joints, projection."""
     _, px, quality = _BUDGET[video]
     size = (camera.intrinsics.width, camera.intrinsics.height)
     views = views_of(camera, rows, motion, status_at(motion, camera.frame_t_ns[rows]), origin_ns)
@@ -502,5 +504,20 @@ def _cut(
         window = _square_about(middle, side, size)
         encoded = _as_webp(cut_out(picture, size, window, px), quality)
         joints = (view.reprojected - [window.left, window.top]) / window.width
-        found.append((row, encoded, joints))
+        projection = _projection_near(camera, row, (window.left, window.top, window.width))
+        found.append((row, encoded, joints, projection))
+    return found
+
+
+def _projection_near(camera: FilmedCamera, row: int, window: tuple[float, float, float]) -> Float:
+    """Return the projection [3, 4] from the world into a window, linear about the middle of it; else NaN."""
+    left, top, side = window
+    position, rotation = (part[0] for part in camera.poses_at(camera.frame_t_ns[[row]]))
+    middle = np.append(undistort(np.array([[left + side / 2, top + side / 2]]), camera.intrinsics)[0], 1.0)
+    step = 1e-3
+    pixel = project(middle + np.vstack([np.zeros(3), step * np.eye(3)[:2]]), camera.intrinsics)
+    slope = (pixel[1:] - pixel[0]).T / step
+    linear = np.vstack([np.column_stack([slope, pixel[0] - slope @ middle[:2]]), [0.0, 0.0, 1.0]])
+    into = np.array([[1 / side, 0.0, -left / side], [0.0, 1 / side, -top / side], [0.0, 0.0, 1.0]])
+    found: Float = into @ linear @ np.column_stack([rotation.T, -rotation.T @ position])
     return found

@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.body_model import ABOVE, BELOW, body_model
+from pipelines.geometry.poses import multiply
+from pipelines.geometry.rig import BONES
 from pipelines.reporting.arms import ArmTrack, RaisedSurface, Replan, surface
 from pipelines.reporting.content import (
     FULL_SCALE,
@@ -30,7 +33,7 @@ from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.people import DERIVED, bones_of
-from pipelines.session.records import Trajectory
+from pipelines.session.records import MovingBody, Trajectory
 from pipelines.session.tables import trajectory_from
 
 if TYPE_CHECKING:
@@ -44,6 +47,10 @@ MAX_TIMES_WITHOUT_SKELETON = 3000
 FARTHEST_JOINT_M = 32.767
 # Square roots are computed a part at a time, so that the others take no memory meanwhile.
 MATRICES_AT_ONCE = 1 << 15
+# Vertices of the drawn surface are this far apart, of a stature of 1: more triangles make the page slow.
+SKIN_CELL = 0.027
+# Of more bones a vertex takes a share that nobody sees.
+SKIN_BONES = 4
 # Pictures farther apart are no film any more, and are noted.
 FILM_STEP_S = 0.2
 
@@ -62,6 +69,7 @@ class ViewerScene:
     arms: tuple[str, ...] = ()  # of a comparison of planners; their cameras can be shown as well
     surface: bool = False  # True if the map's surface is there
     film: tuple[str, ...] = ()  # cameras with pictures
+    skin: bool = False  # True if the surfaces of people are there
 
 
 def make_scene(
@@ -69,6 +77,7 @@ def make_scene(
     poses: Mapping[str, pd.DataFrame],
     replan: Replan | None = None,
     strips: Sequence[Strip] = (),
+    bodies: Sequence[MovingBody] = (),
 ) -> ViewerScene | None:
     """Pack a session for the viewer; None where there is nothing to be seen.
 
@@ -85,6 +94,7 @@ def make_scene(
     arms = [arm for arm in replan.arms if arm.simulated] if replan is not None else []
     all_cameras = len(cameras) + sum(len(arm.cameras) for arm in arms)
     per_time = all_cameras * (3 * 4 + 4 * 2) + (0 if body is None else body.bytes_per_time)
+    per_time += len(bodies) * len(BONES) * 8 * 2
     every = max(math.ceil(len(all_t_ns) * per_time / MAX_BYTES), 1)
     kept = slice(None, None, every)
     t_ns = all_t_ns[kept]
@@ -104,12 +114,14 @@ def make_scene(
     }
     if body is not None:
         data["body"] = body.packed(kept, origin) | {"names": list(summary.people)}
+        if bodies:
+            data["skin"] = _packed_skin(bodies, t_ns, body.middle[kept])
     around = surface(replan.around) if replan is not None and replan.around is not None else None
     if around is not None and around.voxels:
         points = _packed(1000 * (around.points - origin), np.int32)
         data["surface"] = {"cube": around.cube_m, "points": points}
     if body is not None and strips:
-        data["film"] = [_packed_strip(strip, summary.origin_ns) for strip in strips]
+        data["film"] = [_packed_strip(strip, summary.origin_ns, origin) for strip in strips]
     return ViewerScene(
         data=data,
         people=summary.people if body is not None else (),
@@ -119,6 +131,7 @@ def make_scene(
         arms=tuple(arm.name for arm in arms),
         surface="surface" in data,
         film=tuple(strip.camera for strip in strips) if body is not None else (),
+        skin="skin" in data,
     )
 
 
@@ -144,13 +157,16 @@ def _notes(
     return notes
 
 
-def _packed_strip(strip: Strip, origin_ns: int) -> dict[str, object]:
+def _packed_strip(strip: Strip, origin_ns: int, origin: Float) -> dict[str, object]:
     """Return a camera's pictures as JSON."""
+    moved = strip.projection.copy()
+    moved[..., 3] += strip.projection[..., :3] @ origin
     return {
         "name": strip.camera,
         "t": _packed(np.round((strip.t_ns - origin_ns) / 1e5), np.int32),
         "pictures": list(strip.pictures),
         "joints": _packed(FULL_SCALE * strip.joints, np.int16),
+        "projection": base64.b64encode(moved.astype("<f4").tobytes()).decode("ascii"),
     }
 
 
@@ -233,6 +249,42 @@ class _PackedBody:
             for count, noun in far
             if count
         ]
+
+
+def _packed_skin(bodies: Sequence[MovingBody], t_ns: Int64, middle: Float) -> dict[str, object]:
+    """Return the surfaces of people as JSON: few triangles once, and their bones at times [T].
+
+    Args:
+        bodies: of people.
+        t_ns: [T].
+        middle: [T, P, 3] m, of the people's joints, from which centres of bones count.
+    """
+    vertices, triangles = body_model().simplified(SKIN_CELL)
+    packed = []
+    for body in bodies:
+        row = np.searchsorted(body.t_ns, t_ns).clip(0, len(body.t_ns) - 1)
+        known = (body.t_ns[row] == t_ns)[:, None]
+        sigma_mm = np.where(known, np.minimum(1000 * body.sigma_m[row], np.iinfo(np.int16).max), np.nan)
+        skin = body_model().skin(body.shape)
+        turn = multiply(body.rotation[row], body_model().neutral_from_rest)
+        centre = np.where(known[..., None], body.centre[row] - middle[:, body.person, None], np.nan)
+        packed.append(
+            {
+                "person": body.person,
+                "rest": _packed(1000 * skin.rest[vertices], np.int16),
+                "joints": _packed(1000 * body_model().hinges(body.shape)[: len(BONES)], np.int16),
+                "centre": _packed(1000 * centre, np.int16),
+                "turn": _packed(32767 * turn, np.int16),
+                "sigma": _packed(sigma_mm, np.int16),
+            }
+        )
+    return {
+        "triangles": _packed(triangles.astype(np.float64), np.int16),
+        "bone": _packed(skin.bone[vertices, :SKIN_BONES].astype(np.float64), np.int16),
+        "weight": _packed(32767 * skin.weight[vertices, :SKIN_BONES], np.int16),
+        "between": np.stack([ABOVE, BELOW], axis=1).tolist(),
+        "bodies": packed,
+    }
 
 
 def _square_root(covariance: Float) -> Float | None:

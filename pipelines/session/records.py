@@ -127,6 +127,7 @@ class MovingBody:
     shape: Float  # [12]
     centre: Float  # [T, 22, 3] m, joints of the bones
     rotation: Float  # [T, 22, 4] world_from_bone relative to the neutral pose
+    sigma_m: Float  # [T, 22] root of the trace of the joints' covariances; NaN if unknown
 
 
 @dataclass(frozen=True)

@@ -420,8 +420,12 @@ def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = 
 
 
 def load_bodies(bodies_path: Path, shapes_path: Path) -> list[MovingBody]:
-    """Load the bodies of tables of `tables.BODY` and `tables.BODY_SHAPE`, one of each person with rows."""
-    table, shapes = read_table(bodies_path, BODY), read_table(shapes_path, BODY_SHAPE)
+    """Load the bodies of two files, see `moving_bodies`."""
+    return moving_bodies(read_table(bodies_path, BODY), read_table(shapes_path, BODY_SHAPE))
+
+
+def moving_bodies(table: pd.DataFrame, shapes: pd.DataFrame) -> list[MovingBody]:
+    """Return the bodies of tables of `tables.BODY` and `tables.BODY_SHAPE`, one of each person with rows."""
     bodies = []
     for person in np.unique(table["person"].to_numpy(np.int64)).tolist():
         rows = table[table["person"] == person].sort_values("t_ns", kind="stable")
@@ -429,7 +433,8 @@ def load_bodies(bodies_path: Path, shapes_path: Path) -> list[MovingBody]:
         t_ns = np.unique(rows["t_ns"].to_numpy(np.int64))
         centre = rows[["x", "y", "z"]].to_numpy(np.float64).reshape(len(t_ns), -1, 3)
         turn = rows[["qx", "qy", "qz", "qw"]].to_numpy(np.float64).reshape(len(t_ns), -1, 4)
-        bodies.append(MovingBody(person, t_ns, numbers, centre, turn))
+        sigma = np.sqrt(rows[["cxx", "cyy", "czz"]].to_numpy(np.float64).sum(axis=1)).reshape(len(t_ns), -1)
+        bodies.append(MovingBody(person, t_ns, numbers, centre, turn, sigma))
     return bodies
 
 

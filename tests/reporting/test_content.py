@@ -88,6 +88,12 @@ def test_pictures_keep_to_their_budget_and_show_the_person(content: SessionConte
         known = strip.joints[np.isfinite(strip.joints)]
         assert np.percentile(known, 5) > 0
         assert np.percentile(known, 95) < 1
+        motion, row = summary.motion, len(strip.t_ns) // 2
+        assert motion is not None
+        joints = motion.measured_position[np.abs(motion.t_ns - strip.t_ns[row]).argmin(), 0]
+        seen = np.column_stack([joints, np.ones(len(joints))]) @ strip.projection[row].T
+        away = seen[:, :2] / seen[:, 2:] - strip.joints[row, 0, : len(joints)]
+        assert np.nanmedian(np.abs(away)) < 0.03
     scene = make_scene(summary, content.poses, strips=strips)
     assert scene is not None
     apart_s = max(float(np.median(np.diff(strip.t_ns))) / 1e9 for strip in strips)

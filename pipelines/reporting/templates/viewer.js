@@ -31,6 +31,14 @@
     root: scene.body.root && numbers(scene.body.root, Int16Array),
   };
   const surface = scene.surface && { ...scene.surface, points: numbers(scene.surface.points, Int32Array) };
+  const skin = scene.skin && {
+    ...scene.skin,
+    ...Object.fromEntries(["triangles", "bone", "weight"].map((name) => [name, numbers(scene.skin[name], Int16Array)])),
+    bodies: scene.skin.bodies.map((each) => ({
+      person: each.person,
+      ...Object.fromEntries(["rest", "joints", "centre", "turn", "sigma"].map((name) => [name, numbers(each[name], Int16Array)])),
+    })),
+  };
   const people = body ? body.people : 0;
   const jointCount = body ? body.joints.length : 0;
 
@@ -426,6 +434,100 @@
     return [{ depth: apex[2], draw }, { depth: -1, draw: tag }];
   }
 
+  const matrixOf = ([x, y, z, w]) => [
+    1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+    2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+    2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+  ];
+
+  /** The vertices of a person's surface at a stored time, each with its standard deviation in m; null without. */
+  function skinAt({ person, rest, joints, centre, turn, sigma }, k) {
+    const bones = joints.length / 3;
+    if (k < 0 || !known(centre, k * bones) || !known(body.middle, k * people + person)) return null;
+    const middle = triple(body.middle, k * people + person);
+    const turns = Array.from({ length: bones }, (_, b) => Array.from(turn.subarray(4 * (k * bones + b), 4 * (k * bones + b) + 4)));
+    const pivots = Array.from({ length: bones }, (_, b) => b);
+    for (const [above, below] of skin.between) {
+      turns.push(turnedTowards(turns[above], turns[below], 0.5));
+      pivots.push(below);
+    }
+    // Bones between two others turn half as far, about the joint of the lower one (geometry/body_model.py).
+    const parts = turns.map((each, b) => {
+      const matrix = matrixOf(each.map((value) => value / Math.hypot(...each)));
+      const [from, to] = [triple(joints, pivots[b]), triple(centre, k * bones + pivots[b])];
+      const shift = [0, 1, 2].map((i) => middle[i] + to[i] - matrix[3 * i] * from[0] - matrix[3 * i + 1] * from[1] - matrix[3 * i + 2] * from[2]);
+      return { matrix, shift, sigma: sigma[k * bones + pivots[b]] / 1e3 };
+    });
+    const shares = skin.bone.length / (rest.length / 3);
+    return Array.from({ length: rest.length / 3 }, (_, v) => {
+      const point = triple(rest, v);
+      const found = [0, 0, 0, 0];
+      let whole = 0;
+      for (let s = shares * v; s < shares * (v + 1); s++) {
+        const { matrix, shift, sigma: spread } = parts[skin.bone[s]];
+        const weight = skin.weight[s];
+        whole += weight;
+        for (let i = 0; i < 3; i++) {
+          found[i] += weight * (matrix[3 * i] * point[0] + matrix[3 * i + 1] * point[1] + matrix[3 * i + 2] * point[2] + shift[i]);
+        }
+        found[3] += weight * spread;
+      }
+      return found.map((value) => value / whole);
+    });
+  }
+
+  const layer = document.createElement("canvas");
+
+  /** Green below 1 cm, red from 30 cm on, in equal ratios. */
+  const hueOf = (sigma) => 130 * (1 - Math.min(Math.max(Math.log(sigma / 0.01) / Math.log(30), 0), 1));
+
+  /** Draw the sides of a surface that face the eye, far ones first; `place` gives x, y and depth of a vertex. */
+  function drawSkin(context, vertices, place, alpha) {
+    const placed = vertices.map(place);
+    const shownOnes = [];
+    for (let f = 0; f < skin.triangles.length; f += 3) {
+      const [i, j, k] = skin.triangles.subarray(f, f + 3);
+      const [a, b, c] = [placed[i], placed[j], placed[k]];
+      if (!a || !b || !c) continue;
+      if ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0) continue;
+      const [u, v] = [vertices[j], vertices[k]].map((other) => [0, 1, 2].map((axis) => other[axis] - vertices[i][axis]));
+      const normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+      const light = normal[2] / (Math.hypot(...normal) || 1);
+      shownOnes.push({ depth: a[2] + b[2] + c[2], corners: [a, b, c], light, sigma: vertices[i][3] });
+    }
+    shownOnes.sort((a, b) => b.depth - a.depth);
+    // On a layer of its own: there triangles that overlap do not add up.
+    layer.width = context.canvas.width;
+    layer.height = context.canvas.height;
+    const own = layer.getContext("2d");
+    own.setTransform(context.getTransform());
+    own.lineWidth = 0.7;
+    for (const { corners, light, sigma } of shownOnes) {
+      own.fillStyle = own.strokeStyle = `hsl(${hueOf(sigma)} 45% ${54 + 20 * light}%)`;
+      own.beginPath();
+      for (const [x, y] of corners) own.lineTo(x, y);
+      own.closePath();
+      own.fill();
+      own.stroke(); // closes the hair lines between neighbours
+    }
+    context.save();
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.globalAlpha = alpha;
+    context.drawImage(layer, 0, 0);
+    context.restore();
+  }
+
+  function drawSkins(eye, at) {
+    const place = (vertex) => {
+      const q = eye.inside(vertex);
+      return q[2] < eye.near ? null : [...eye.flat(q), q[2]];
+    };
+    for (const each of skin.bodies) {
+      const vertices = skinAt(each, at.near);
+      if (vertices) drawSkin(eye.context, vertices, place, 0.75);
+    }
+  }
+
   const depthOf = (eye, a, b) => (eye.inside(a)[2] + eye.inside(b)[2]) / 2;
 
   function drawShadow(eye, joints, p, at) {
@@ -556,6 +658,7 @@
     }
     shownCameras().forEach(([camera, c]) => c === eye.own || parts.push(...cameraParts(eye, camera, c, at)));
     parts.sort((a, b) => b.depth - a.depth);
+    if (skin && shown("skin")) drawSkins(eye, at);
     for (const part of [...around, ...parts]) part.draw();
     if (eye.frame) {
       Object.assign(context, { strokeStyle: colours.cameras[eye.own], lineWidth: 1.2 });
@@ -697,6 +800,7 @@
     words: element(`film-time-${k}`),
     time: Float64Array.from(numbers(film.t, Int32Array), (t) => t / 1e4),
     joints: numbers(film.joints, Int16Array),
+    projection: numbers(film.projection, Float32Array),
     images: film.pictures.map(() => null),
     pictures: film.pictures,
   }));
@@ -726,6 +830,17 @@
     if (image.complete && image.naturalWidth) context.drawImage(image, 0, 0, size, size);
     imageOf(film, Math.min(row + 1, film.time.length - 1));
     film.words.textContent = seconds(film.time[row]);
+    if (skin && shown("skin")) {
+      const p = film.projection.subarray(12 * row, 12 * row + 12);
+      const place = (vertex) => {
+        const [x, y, z] = [0, 4, 8].map((r) => p[r] * vertex[0] + p[r + 1] * vertex[1] + p[r + 2] * vertex[2] + p[r + 3]);
+        return z > 0.05 ? [x / z * size, y / z * size, z] : null;
+      };
+      for (const each of skin.bodies) {
+        const vertices = skinAt(each, bracket(film.time[row]).near);
+        if (vertices) drawSkin(context, vertices, place, 0.5);
+      }
+    }
     const count = film.joints.length / 2 / film.time.length / people;
     for (let p = 0; p < people; p++) {
       const at = (j) => 2 * ((row * people + p) * count + j);
@@ -887,7 +1002,7 @@
   element("play").addEventListener("click", () => play(!clock.playing));
   element("reset").addEventListener("click", reset);
   element("above").addEventListener("click", fromAbove);
-  for (const name of ["truth", "ellipsoids", "paths", "person", "arm", "surface", "from"]) element(name)?.addEventListener("change", showSoon);
+  for (const name of ["truth", "ellipsoids", "paths", "person", "arm", "surface", "skin", "from"]) element(name)?.addEventListener("change", showSoon);
   addEventListener("hashchange", () => goTo(location.hash));
   document.addEventListener("click", (event) => {
     const link = event.target.closest?.('a[href^="#t="]');

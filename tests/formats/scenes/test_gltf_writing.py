@@ -80,7 +80,7 @@ def body_of(t_ns: np.ndarray[Any, Any]) -> MovingBody:
     skinning = Skinning(joint, model.neutral_from_rest, steps)
     matrix, translation = skinning.transforms(root, rotation)
     centre = np.einsum("tbij,bj->tbi", matrix[:, : len(BONES)], joint) + translation[:, : len(BONES)]
-    return MovingBody(0, t_ns, shape, centre, rotation)
+    return MovingBody(0, t_ns, shape, centre, rotation, np.ones(centre.shape[:2]))
 
 
 def test_the_skin_of_the_file_is_the_surface_of_the_model(tmp_path: Path) -> None:
