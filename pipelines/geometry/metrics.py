@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Index, Int64
 
 Series = tuple[Float, Float]
 """Sums [T] and weights [T] of a figure at every moment or trial: the figure is the ratio of their totals."""
@@ -27,6 +27,8 @@ _GAP_STEPS = 3
 _SIGMA_PER_MAD = 1.4826
 # World errors are computed in segments of so many samples, as in SLAHMR (Ye et al., CVPR 2023).
 _SEGMENT_SAMPLES = 100
+# People without a common time are matched last, and a wild joint counts no more than this.
+_NEVER_TOGETHER_M, _LARGEST_ERROR_M = 1e6, 1e3
 # A foot whose true speed is lower stands: 10 mm in a frame of 30 Hz (WHAM).
 _STANDING_M_S = 0.3
 # Foot sliding is stated in millimetres for each picture of a 30 Hz film (WHAM).
@@ -491,6 +493,26 @@ _TAIL_PERCENT = 2.5
 _MIN_STRETCHES = 5
 # Fewer samples or trials do not tell how a figure scatters.
 _MIN_SAMPLES, _MIN_TRIALS = 10, 2
+
+
+def matched(position: Float, others: Float) -> tuple[Index, Index]:
+    """Match people of [T, P, J, 3] and [T, Q, J, 3], nearest on average and each once: rows of both."""
+    from scipy.optimize import linear_sum_assignment
+
+    distance = _length(position[:, :, None] - others[:, None])
+    shared = np.isfinite(distance)
+    count = shared.sum(axis=(0, 3))
+    total = np.where(shared, np.minimum(distance, _LARGEST_ERROR_M), 0.0).sum(axis=(0, 3))
+    own, match = linear_sum_assignment(np.where(count > 0, total / np.maximum(count, 1), _NEVER_TOGETHER_M))
+    return own, match
+
+
+def own_truth(position: Float, truth: Float) -> Float:
+    """Return the truth of each person [T, P, J, 3], the nearest true one (`matched`); NaN without one."""
+    own: Float = np.full(position.shape, np.nan)
+    person, match = matched(position, truth)
+    own[:, person] = truth[:, match]
+    return own
 
 
 def stretch_samples(t_ns: Int64) -> int:

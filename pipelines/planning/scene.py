@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
+from pipelines.geometry.metrics import matched
 from pipelines.geometry.noise import NoiseModel, White, sum_sigma
 from pipelines.geometry.poses import gaps, interpolate_points, rates
 from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
@@ -53,8 +54,6 @@ LONG_GAP_NS = 1_000_000_000
 COMMAND_HOLDS_NS = 2_000_000_000
 # A shorter flight has too few plans to compare.
 MIN_FLIGHT_S = 1.0
-# People without a common time are matched last: no distance is as large.
-NEVER_TOGETHER_M = 1e6
 # Voxels of 0.5 m, soft ground and errors of the hips explain less between the map's ground and the feet.
 LARGEST_OFFSET_M = 1.0
 # Probabilities are 0 to 1, so that this marks places beyond the map.
@@ -226,8 +225,6 @@ def _reconstruction(folder: Path) -> JointMotion:
 
 def _of_people(skeleton: JointMotion, t_ns: Int64, actor: Float, *, logged: bool) -> JointMotion:
     """Return the skeletons of the P people whose hips [A, P, 3] were measured; NaN for those without one."""
-    from scipy.optimize import linear_sum_assignment
-
     people = actor.shape[1]
     position = np.full((len(skeleton.t_ns), people, *skeleton.position.shape[2:]), np.nan)
     hips = _hips_of(skeleton)
@@ -235,10 +232,7 @@ def _of_people(skeleton: JointMotion, t_ns: Int64, actor: Float, *, logged: bool
         person = whose = np.arange(min(people, skeleton.position.shape[1]))
     else:
         there = positions_at(t_ns, actor, skeleton.t_ns).swapaxes(0, 1)
-        apart = np.linalg.norm(hips[:, None] - there[:, :, None], axis=-1)  # [T, P, Q]
-        known = np.isfinite(apart)
-        mean = np.where(known, apart, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        person, whose = linear_sum_assignment(np.where(known.any(axis=0), mean, NEVER_TOGETHER_M))
+        person, whose = matched(there[:, :, None], hips[:, :, None])
     position[:, person] = skeleton.position[:, whose]
     return JointMotion(skeleton.t_ns, skeleton.joints, position)
 

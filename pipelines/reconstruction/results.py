@@ -29,6 +29,7 @@ from pipelines.geometry.metrics import (
     intervals,
     measure,
     measure_shape,
+    own_truth,
     stretch_samples,
     tracking_errors,
     world_errors,
@@ -101,7 +102,7 @@ def assess(
     errors: dict[str, Any] = {**_UNMEASURED, "per_joint": {}}
     own = None
     if truth is not None:
-        own = _own_truth(position, truth)
+        own = own_truth(position, truth)
         errors |= measure(position, own, observations.joints, observations.t_ns)
         errors |= world_errors(position, own, observations.joints, observations.t_ns)
     for name, figures in errors.pop("per_joint").items():
@@ -144,7 +145,7 @@ def of_people(
     shape = observations.confidence.shape[:3]
     ok = result.status.reshape(shape) == _OK
     position = np.where(ok[..., None], result.points.reshape(*shape, 3), np.nan)
-    own = None if truth is None else _own_truth(position, truth)
+    own = None if truth is None else own_truth(position, truth)
     tracking = None if truth is None else tracking_errors(position, truth)
     confused = [{}] * len(names) if tracking is None else tracking.pop("by_person")
     return {
@@ -230,22 +231,6 @@ def _spread(residual: Float) -> dict[str, float | None]:
     if not len(distances):
         return {"median": None, "mean": None}
     return {"median": float(np.median(distances)), "mean": float(distances.mean())}
-
-
-def _own_truth(position: Float, truth: Float) -> Float:
-    """Match each reconstructed person [T, P, J, 3] to the nearest true person, each used once."""
-    from scipy.optimize import linear_sum_assignment
-
-    distance = np.linalg.norm(position[:, :, None] - truth[:, None, :], axis=-1)
-    seen = np.isfinite(distance)
-    cost = np.where(seen, np.minimum(distance, 1e3), 0).sum(axis=(0, 3)) / np.maximum(
-        seen.sum(axis=(0, 3)), 1
-    )
-    cost[seen.sum(axis=(0, 3)) == 0] = 1e6
-    person, match = linear_sum_assignment(cost)
-    own = np.full_like(position, np.nan)
-    own[:, person] = truth[:, match]
-    return own
 
 
 def _leave_one_out(

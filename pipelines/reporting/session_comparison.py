@@ -369,14 +369,8 @@ def _measures_table(comparison: Comparison) -> Table:
 
 
 def _pair_table(k: int, pair: Pair) -> Table:
-    columns = (
-        Column("Measure", text=True),
-        Column(pair.first.label),
-        Column(pair.other.label),
-        Column("Difference", "95 % interval"),
-        Column("Pairs"),
-        Column("Verdict", text=True),
-    )
+    columns = [Column("Measure", text=True), Column(pair.first.label), Column(pair.other.label)]
+    columns += [Column("Difference", "95 % interval"), Column("Pairs"), Column("Verdict", text=True)]
     rows = [
         [
             f"{measure.label}, {measure.unit}",

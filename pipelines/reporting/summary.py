@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.metrics import own_truth
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import (
     Bone,
@@ -50,8 +51,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# People without a common time are matched last: no distance is as large.
-NEVER_TOGETHER_M = 1e9
 # Keypoints below this confidence are left out by `reconstruct` where its record states no other.
 DEFAULT_MIN_CONFIDENCE = 0.3
 
@@ -179,21 +178,7 @@ def truth_at(truth: pd.DataFrame, motion: MeasuredMotion) -> Float:
     that are not in the truth.
     """
     known = motion_from(truth, motion.joints)
-    return _own_truth(motion.measured_position, true_joints_at(known, motion.t_ns))
-
-
-def _own_truth(position: Float, truth: Float) -> Float:
-    """Match each measured person of [T, P, J, 3] to the nearest true one on average, each taken once."""
-    from scipy.optimize import linear_sum_assignment
-
-    distance = np.linalg.norm(position[:, :, None] - truth[:, None], axis=-1)
-    shared = np.isfinite(distance)
-    count = shared.sum(axis=(0, 3))
-    total = np.where(shared, distance, 0.0).sum(axis=(0, 3))
-    person, match = linear_sum_assignment(np.where(count > 0, total / np.maximum(count, 1), NEVER_TOGETHER_M))
-    own: Float = np.full(position.shape, np.nan)
-    own[:, person] = truth[:, match]
-    return own
+    return own_truth(motion.measured_position, true_joints_at(known, motion.t_ns))
 
 
 def _status_counts(motion: MeasuredMotion) -> dict[str, int]:
@@ -355,18 +340,10 @@ def table_of_joints(summary: Summary) -> Table:
 
 def table_of_cameras(content: SessionContent, summary: Summary, started: str) -> Table:
     """Make the table of what was ingested; `started` is the zero of its times."""
-    columns = (
-        Column("Camera", text=True),
-        Column("Picture", "px"),
-        Column("Frames"),
-        Column("Rate", "Hz"),
-        Column("Span", "s"),
-        Column("Poses"),
-        Column("Gaps", "in poses"),
-        Column("Frames", "without pose"),
-        Column("Frames", "without person"),
-        Column("Keypoints", text=True),
-    )
+    columns = [Column("Camera", text=True), Column("Picture", "px"), Column("Frames"), Column("Rate", "Hz")]
+    columns += [Column("Span", "s"), Column("Poses"), Column("Gaps", "in poses")]
+    columns += [Column("Frames", "without pose"), Column("Frames", "without person")]
+    columns += [Column("Keypoints", text=True)]
     settings = section(content.stages.get("detect", {}), "settings")
     detector = settings.get("detector") or "a detector"
     rows = []
@@ -396,14 +373,9 @@ def table_of_cameras(content: SessionContent, summary: Summary, started: str) ->
 
 def table_of_quality(content: SessionContent, summary: Summary) -> Table:
     """Make the table of the quality of every camera's data."""
-    columns = (
-        Column("Camera", text=True),
-        Column("Pose noise", text=True),
-        Column("Clock", "offset"),
-        Column("Clock", "σ"),
-        Column("Person found", "of frames"),
-        Column("Keypoints used", "of those found"),
-    )
+    columns = [Column("Camera", text=True), Column("Pose noise", text=True), Column("Clock", "offset")]
+    columns += [Column("Clock", "σ"), Column("Person found", "of frames")]
+    columns += [Column("Keypoints used", "of those found")]
     caption = "Pose noise is per axis. A clock’s offset is as stated, plus what was estimated."
     rows = [_quality(content, summary, camera) for camera in summary.cameras]
     return Table("quality", caption, columns, rows, "quality")
