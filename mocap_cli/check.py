@@ -7,7 +7,7 @@ import click
 
 from mocap_cli.options import Shown, cores_option, output_options
 from mocap_cli.several import each
-from mocap_cli.terminal import say, say_warnings, watching
+from mocap_cli.terminal import say, say_next, say_warnings, watching
 from pipelines.session.errors import DataError
 
 
@@ -54,4 +54,7 @@ def check_command(
     if not result.doubts:
         looked = f" (looked at: {result.pictures})" if result.pictures else ""
         say(f"{path}: no doubt{looked}")
+    if path.suffix in {".yaml", ".yml"}:
+        follows = "mocap check --fix {}" if result.doubts and not fix else "mocap ingest {}"
+        say_next(follows, path, shown.quiet)
     return None

@@ -9,7 +9,7 @@ import click
 
 from mocap_cli.options import FiniteRange, Shown, any_place, force_option, output_options, overwrite_option
 from mocap_cli.several import each
-from mocap_cli.terminal import one_line, print_table, say, say_warnings, watching
+from mocap_cli.terminal import one_line, print_table, say, say_next, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.ingest import Ingested
@@ -76,6 +76,7 @@ def ingest_command(
         _print_stamps(result)
         _print_origin(result)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
+    say_next("mocap reconstruct {}", result.folder, shown.quiet)
     return None
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from mocap_cli.options import Shown, any_path, example_option, output_options, overwrite_option
-from mocap_cli.terminal import one_line, print_json, say, watching
+from mocap_cli.terminal import one_line, print_json, say, say_next, watching
 
 # More files of one kind in one folder are counted instead of listed.
 _MANY = 5
@@ -62,6 +62,8 @@ def init_command(
     else:
         say(f"cameras: {', '.join(result.cameras) or 'none'}")
         say(f"written: {_from_here(result.path)}")
+        first = "write what is missing, then " if result.missing else ""
+        say_next(f"{first}mocap check {{}}", _from_here(result.path), shown.quiet)
     if not result.cameras:
         raise SystemExit(1)
 
@@ -81,6 +83,7 @@ def _write_example(name: str, output: Path | None, overwrite: bool, shown: Shown
     if not shown.quiet:
         say("simulated; its keypoints have the measured errors of a detector")
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'flight.yaml'}")
+    say_next("mocap run {}", result.folder / "flight.yaml", shown.quiet)
 
 
 def _from_here(path: Path) -> Path:

@@ -22,7 +22,7 @@ from mocap_cli.options import (
     scheduler_option,
 )
 from mocap_cli.several import each
-from mocap_cli.terminal import print_table, say, say_warnings, watching
+from mocap_cli.terminal import print_table, say, say_next, say_warnings, watching
 
 if TYPE_CHECKING:
     from mocap_cli.options import ChosenPictures
@@ -168,12 +168,13 @@ def reconstruct_command(
     return None
 
 
-def print_verdict(verdict: dict[str, Any], session: Path, *, reported: bool = False) -> None:
+def print_verdict(verdict: dict[str, Any], session: Path, flight: Path | None = None) -> None:
     """Print how good the result is without truth, what holds it back, and the next command.
 
     Args:
         verdict: of metrics.json.
-        reported: the page is written, so that the next command is another one.
+        session: the session.
+        flight: its manifest, if the page is written, so that the next command is another one.
     """
     expected = verdict["expected_error_mm"]
     error = "nothing was measured"
@@ -184,9 +185,11 @@ def print_verdict(verdict: dict[str, Any], session: Path, *, reported: bool = Fa
     for reason in verdict["why"]:
         say(f"  {reason}")
     follows = verdict["next"]
-    if reported and follows.startswith("mocap report"):
-        follows = "mocap export SESSION --to trc,angles"
-    say(f"next: {follows.replace('SESSION', str(session))}")
+    if flight is None or "SESSION" in follows:
+        follows = follows.replace("SESSION", "{}") if flight is None else "mocap export {} --to trc,angles"
+        say_next(follows, session, quiet=False)
+    else:
+        say_next(follows.replace("flight.yaml", "{}"), flight, quiet=False)
 
 
 def _print(result: Reconstructed, *, every_joint: bool) -> None:

@@ -9,7 +9,7 @@ import click
 
 from mocap_cli.options import Shown, force_option, grouped, output_options
 from mocap_cli.several import each
-from mocap_cli.terminal import print_table, say, say_warnings, watching
+from mocap_cli.terminal import print_table, say, say_next, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.film import FilmSettings
@@ -133,6 +133,7 @@ def replan_compare_command(
     place = result.folder / "replan"
     said = "unchanged" if result.skipped else "written"
     say(f"{said}: {place} (kept as {place / result.metrics['name']})")
+    say_next("mocap report {}", result.folder, shown.quiet)
     return None
 
 

@@ -61,7 +61,7 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
         listed = "; ".join(map(one_line, assumed))
         say(f"{len(assumed)} assumptions, marked in {manifest}: {listed}", err=True)
     say(f"page: {result.page}")
-    print_verdict(verdict, result.session, reported=True)
+    print_verdict(verdict, result.session, manifest)
 
 
 class _Questions:

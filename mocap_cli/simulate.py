@@ -13,7 +13,7 @@ from mocap_cli.options import (
     overwrite_option,
     workers_option,
 )
-from mocap_cli.terminal import print_json, print_table, say, watching
+from mocap_cli.terminal import print_json, print_table, say, say_next, watching
 
 
 @click.command("simulate", short_help="Make a flight with known truth.")
@@ -65,3 +65,4 @@ def simulate_command(
         say(f"{summary['name']}: {summary['duration_s']:g} s, simulated, {summary['pictures']}")
         print_table(("camera", "frames", "poses"), rows)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'flight.yaml'}")
+    say_next("mocap run {}", result.folder / "flight.yaml", shown.quiet)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import json
 import logging
+import shlex
 import sys
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -129,6 +131,12 @@ def _noting_compilation(notes: _Notes) -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+def say_next(command: str, place: Path, quiet: bool) -> None:
+    """Print the next command of the user's way, as the last line; `{}` in it stands for a path."""
+    if not quiet:
+        say(f"next: {command.format(shlex.quote(str(place)))}")
 
 
 def say_warnings(warnings: Sequence[str], quiet: bool) -> None:
