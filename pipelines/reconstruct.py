@@ -676,7 +676,8 @@ def clocks_of(
             by = {cameras[c].name: "background" for c in np.flatnonzero(wrong)}
             offset_s, sigma_s = np.where(moved, [offset_s, sigma_s], 0.0)
             clocks = FoundClocks(offset_s, sigma_s, none, wrong=by)
-            cameras, prior_s = shifted(cameras, clocks.offset_s), np.where(known, 0.0, prior_s)
+            cameras, prior_s = shifted(cameras, clocks.offset_s), np.where(known, sigma_s, prior_s)
+            stated = stated | known
     prior_s = with_reference(description, cameras, prior_s)
     if len(cameras) == 1:  # rays of one camera meet nothing that could show its clock
         return clocks, prior_s, None
