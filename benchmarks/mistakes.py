@@ -37,6 +37,7 @@ from pipelines.detect import detect, follow
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.description import Doubt
+from pipelines.session.errors import DataError
 from pipelines.session.stages import locked
 from tests.synthetic.described_flights import (
     FLIGHTS,
@@ -174,8 +175,12 @@ def expected_errors(folder: Path, seeds: Iterable[int]) -> list[str]:
         session = own.folder / "expected.session"
         shutil.rmtree(session, ignore_errors=True)
         ingest(written(document, made.with_name("expected.yaml")), session)
-        with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):
-            metrics = reconstruct(session, ReconstructSettings()).metrics
+        try:
+            with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):
+                metrics = reconstruct(session, ReconstructSettings()).metrics
+        except DataError as error:
+            print(f"| {seed} | {geometry} | refused: {error.code} | | |", flush=True)
+            continue
         low, median, high = metrics["verdict"]["expected_error_mm"]
         error, source = metrics["mpjpe_mm"], metrics["method_used"]["pose_noise"]
         for kind in ("all", geometry, f"pose noise {source}"):
