@@ -102,3 +102,21 @@ class ClockFit:
         drifted = np.rint((t_ns - self.at_ns) * (self.drift_ppm * 1e-6)).astype(np.int64)
         moved: Int64 = t_ns + (self.offset_ns + drifted)
         return moved
+
+
+def known_median(values: Float, axis: int) -> Float:
+    """Return the median without NaN along an axis, by sorting; NaN where there is nothing else."""
+    ordered = np.sort(values, axis=axis)
+    count = np.isfinite(ordered).sum(axis=axis, keepdims=True)
+    low, high = np.maximum((count - 1) // 2, 0), np.maximum(count // 2, 0)
+    middle = (np.take_along_axis(ordered, low, axis) + np.take_along_axis(ordered, high, axis)) / 2
+    return np.asarray(np.squeeze(middle, axis))
+
+
+def nearest_rows(ascending: Int64, values: Int64) -> Int64:
+    """Find the row of ascending numbers that is nearest to each value; of two the earlier."""
+    last = len(ascending) - 1
+    after = np.clip(np.searchsorted(ascending, values), min(1, last), last)
+    before = np.maximum(after - 1, 0)
+    is_after = ascending[after] - values < values - ascending[before]
+    return np.where(is_after, after, before).astype(np.int64)

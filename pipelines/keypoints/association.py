@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64, known_median
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.keypoints.bodies import (
     SAME_BODY_M,
     Bodies,
     SightLines,
     find_bodies,
-    median_of,
     meeting_points,
     rays_of,
 )
@@ -168,7 +167,7 @@ def associate_one_camera(
     track, there = seen.track[:, 0], np.isfinite(views.xy).all(axis=-1) & (views.confidence > 0)
     trust = np.where(there, views.confidence, 0.0).sum(axis=(1, 3))
     ray = rays_of(views.xy[:, 0], np.nan_to_num(views.rotation[:, 0]))
-    middle = median_of(np.where(there[:, 0, ..., None], ray, np.nan), axis=2)
+    middle = known_median(np.where(there[:, 0, ..., None], ray, np.nan), axis=2)
     bodies = []
     for identity in np.unique(track[track >= 0]).tolist():
         time, detection = np.nonzero(track == identity)
@@ -522,7 +521,7 @@ def _missed(views: SightLines, rotation: Float, detection: Int64, rows: slice) -
     points, _ = meeting_points(rays, np.broadcast_to(origin[:, None], rays.shape), weight)
     u, v, depth = np.einsum("ncji,nckj->inck", rotation, points[:, None] - origin[:, :, None])
     ahead = np.where(there & (depth > 0), depth, np.nan)
-    return median_of(np.stack([u / ahead, v / ahead], axis=-1) - xy, axis=2)
+    return known_median(np.stack([u / ahead, v / ahead], axis=-1) - xy, axis=2)
 
 
 def _mean(time_s: Float, values: Float) -> Float:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64, known_median
 
 # A pair of detections is one person within 3 sigma.
 _AGREE_CHI2 = 9.0
@@ -105,7 +105,7 @@ def find_bodies(
     """
     # From left to right in each picture, so that the order of the input does not matter.
     given = np.where((views.confidence > 0)[..., None], views.xy, np.nan)
-    x, y = np.moveaxis(median_of(given, axis=3), -1, 0)
+    x, y = np.moveaxis(known_median(given, axis=3), -1, 0)
     order = np.lexsort((y, x), axis=-1)
     views = views._replace(
         xy=np.take_along_axis(views.xy, order[..., None, None], 2),
@@ -186,22 +186,13 @@ def _bodies_of(
 def _sizes(points: Float) -> Float:
     """Compute the median distance [T, C, D] of joints [T, C, D, J, 2] from their middle; NaN without any."""
     with np.errstate(invalid="ignore"):
-        middle = median_of(points, axis=3)
-        return median_of(np.linalg.norm(points - middle[..., None, :], axis=-1), axis=3)
-
-
-def median_of(values: Float, axis: int) -> Float:
-    """Return the median without NaN along an axis, by sorting; NaN where there is nothing else."""
-    ordered = np.sort(values, axis=axis)
-    count = np.isfinite(ordered).sum(axis=axis, keepdims=True)
-    low, high = np.maximum((count - 1) // 2, 0), np.maximum(count // 2, 0)
-    middle = (np.take_along_axis(ordered, low, axis) + np.take_along_axis(ordered, high, axis)) / 2
-    return np.asarray(np.squeeze(middle, axis))
+        middle = known_median(points, axis=3)
+        return known_median(np.linalg.norm(points - middle[..., None, :], axis=-1), axis=3)
 
 
 def _shifts(now: Float, before: Float, size: Float, wait_s: Float) -> Float:
     """Compute shifts of bodies [..., J, 2] against earlier ones, by what is allowed; inf without a joint."""
-    moved = median_of(np.linalg.norm(now - before, axis=-1), axis=-1)
+    moved = known_median(np.linalg.norm(now - before, axis=-1), axis=-1)
     shift = moved / np.maximum(4.0 * size, 1e-12) / (_SHIFT_HEIGHTS + wait_s)
     return np.where(np.isfinite(shift), shift, np.inf)
 
@@ -258,7 +249,7 @@ def _continuity(time_s: Float, points: Float, size: Float, piece: Int64, nodes: 
         last = first + counts - 1
         if not len(t):
             continue
-        middle = median_of(points[t, c, d], axis=1)
+        middle = known_median(points[t, c, d], axis=1)
         rates, known = [], []
         for begin, end in ((np.maximum(first, last - trend), last), (first, np.minimum(last, first + trend))):
             span_s = time_s[t[end]] - time_s[t[begin]]
@@ -374,7 +365,7 @@ def _near_log(views: SightLines, seen: Bool, piece: Int64, rows: Int64, log: Flo
     point_m = np.where(log[t, 3] <= _EXACT_LOG_M, _EXACT_POINT_M, _LOGGED_POINT_M)
     variance = (views.sigma[t, c, None] * depth) ** 2 + (log[t, 3] ** 2 + point_m**2)[:, None]
     square = np.where(depth > 0, np.minimum(off2 / variance, _MAX_CHI2), _MAX_CHI2)
-    median = median_of(np.where(seen[t, c, d], square, np.nan), axis=-1)
+    median = known_median(np.where(seen[t, c, d], square, np.nan), axis=-1)
     return np.asarray(np.bincount(piece[t, c, d], _AGREE_CHI2 - median, count), np.float64)
 
 
@@ -564,7 +555,7 @@ def _placed(views: SightLines, seen: Bool, track: Int64, order: Int64) -> Bodies
         sigma = np.where(with_camera[rows], views.sigma[rows], np.inf)
         weight = np.where(np.moveaxis(seen[at], 2, 1), 1.0 / sigma[:, None] ** 2, 0.0)
         points, _ = meeting_points(rays, np.broadcast_to(position[:, None], rays.shape), weight)
-        place = median_of(points, axis=1)
+        place = known_median(points, axis=1)
         sight = place[:, None] - position
         reach = np.maximum(np.linalg.norm(sight, axis=-1), 1e-6)
         weight = 1.0 / (sigma * reach) ** 2

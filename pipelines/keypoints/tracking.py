@@ -1,7 +1,5 @@
 """Tracking of people through the pictures of one camera: search, identity, loss and return."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence

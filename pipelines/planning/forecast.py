@@ -1,7 +1,5 @@
 """Estimate and forecast of the actor: a Kalman filter with constant velocity."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

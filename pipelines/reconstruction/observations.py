@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics, nearest_rows
 from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion, velocities
@@ -294,10 +294,7 @@ def _timeline(cameras: list[Camera]) -> Int64:
 
 def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
     """Find the frame [T] nearest to each time, -1 where none lies within a frame period."""
-    after = np.clip(np.searchsorted(frame_t_ns, t_ns), 1, max(len(frame_t_ns) - 1, 1))
-    after = np.minimum(after, len(frame_t_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(t_ns - frame_t_ns[before] <= frame_t_ns[after] - t_ns, before, after)
+    nearest = nearest_rows(frame_t_ns, t_ns)
     period = int(np.median(np.diff(frame_t_ns))) if len(frame_t_ns) > 1 else 0
     return np.where(np.abs(frame_t_ns[nearest] - t_ns) <= period, nearest, -1)
 

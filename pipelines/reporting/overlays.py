@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics, Picture
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics, Picture, known_median, nearest_rows
 from pipelines.geometry.cameras import project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.geometry.triangulation import STATUS
@@ -186,7 +186,7 @@ def choose_moments(motion: MeasuredMotion, error_mm: Float | None = None) -> tup
     count = motion.measured.sum(axis=(1, 2))
     around = np.concatenate([count[:1], count, count[-1:]])
     steady = np.minimum(np.minimum(around[:-2], around[2:]), count)
-    error = _row_median(np.where(motion.measured, motion.reprojection_px, np.nan).reshape(len(count), -1))
+    error = known_median(np.where(motion.measured, motion.reprojection_px, np.nan).reshape(len(count), -1), 1)
     eligible = np.isfinite(error) & (steady >= steady.max() / 2)
     if error_mm is not None and np.isfinite(error_mm).any():
         largest = np.nan_to_num(error_mm, nan=-np.inf).max(axis=(1, 2))
@@ -212,7 +212,7 @@ def match_people(reprojected: Float, found: Float) -> list[int | None]:
     """
     matches: list[int | None] = []
     for body in reprojected:
-        distance = _row_median(np.linalg.norm(found - body, axis=-1))
+        distance = known_median(np.linalg.norm(found - body, axis=-1), 1)
         distance[[match for match in matches if match is not None]] = np.nan
         seen = body[np.isfinite(body).all(axis=-1)]
         reach = SAME_PERSON_SHARE * float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
@@ -286,7 +286,7 @@ def status_at(motion: MeasuredMotion, t_ns: Int64) -> NDArray[np.int8]:
     after = np.minimum(before + 1, len(motion.t_ns) - 1)
     step, since = motion.t_ns[after] - motion.t_ns[before], held - motion.t_ns[before]
     known = (held == t_ns) & ((since == 0) | (step <= _longest_step_ns(motion)))
-    return np.where(known[:, None, None], motion.status[_nearest_row(motion, t_ns)], np.int8(-1))
+    return np.where(known[:, None, None], motion.status[nearest_rows(motion.t_ns, t_ns)], np.int8(-1))
 
 
 def angles_at(motion: MeasuredMotion, angles: pd.DataFrame, name: str, t_ns: Int64) -> Float:
@@ -307,14 +307,6 @@ def angles_at(motion: MeasuredMotion, angles: pd.DataFrame, name: str, t_ns: Int
     return np.stack([np.degrees(np.arctan2(across, along)), sigma], axis=-1)
 
 
-def _nearest_row(motion: MeasuredMotion, t_ns: Int64) -> Int64:
-    """Find the skeleton's time nearest to each of [N] times; of two the earlier."""
-    after = np.clip(np.searchsorted(motion.t_ns, t_ns), min(1, len(motion.t_ns) - 1), len(motion.t_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    is_after = motion.t_ns[after] - t_ns < t_ns - motion.t_ns[before]
-    return np.where(is_after, after, before).astype(np.int64)
-
-
 def views_of(
     camera: FilmedCamera, at: Int64, motion: MeasuredMotion, status: NDArray[np.int8], origin_ns: int
 ) -> list[OverlayView]:
@@ -331,7 +323,7 @@ def views_of(
     position, rotation = camera.poses_at(t_ns)
     seen = (points - position[:, None, None]) @ rotation[:, None]
     reprojected = project(seen, camera.intrinsics)
-    stated = np.where(motion.measured[..., None], motion.covariance, np.nan)[_nearest_row(motion, t_ns)]
+    stated = np.where(motion.measured[..., None], motion.covariance, np.nan)[nearest_rows(motion.t_ns, t_ns)]
     spread = seen_spread(
         seen[..., : len(motion.joints), :], stated, rotation[:, None, None], camera.intrinsics
     )
@@ -394,14 +386,6 @@ def _longest_step_ns(motion: MeasuredMotion) -> int:
     """Return the longest step of the skeleton's times that is interpolated."""
     usual_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
     return round(MAX_STEPS_INTERPOLATED * usual_ns)
-
-
-def _row_median(values: Float) -> Float:
-    """Compute the median of the finite numbers in each row; NaN where there are none."""
-    medians = np.full(len(values), np.nan)
-    known = np.isfinite(values).any(axis=1)
-    medians[known] = np.nanmedian(values[known], axis=1)
-    return medians
 
 
 def refined_poses(folder: Path, record: StageRecord) -> dict[str, Trajectory]:

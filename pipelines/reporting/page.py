@@ -1,7 +1,5 @@
 """The pages: of one session, and the table of many flights, each as one self-contained file."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ corner of the page's panels shows where it lies. The viewer's small pictures of 
 same way. Their number follows from a budget of bytes, and their times are spread evenly over the flight.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import replace

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Float, Int64, nearest_rows
 from pipelines.geometry.metrics import (
     LEVEL,
     RESAMPLES,
@@ -260,9 +260,7 @@ def _same_times(a: Int64, b: Int64) -> tuple[Int64, Int64]:
     if len(a) > len(b):
         theirs, ours = _same_times(b, a)
         return ours, theirs
-    after = np.clip(np.searchsorted(b, a), 0, len(b) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(b[after] - a) < np.abs(b[before] - a), after, before)
+    nearest = nearest_rows(b, a)
     step = min((float(np.median(np.diff(t))) for t in (a, b) if len(t) > 1), default=0.0)
     rows = np.flatnonzero(np.abs(b[nearest] - a) <= step / 2)
     chosen, at = np.unique(nearest[rows], return_index=True)

@@ -4,8 +4,6 @@ Rows are plain: the variables, and the measured figures. A study of a walk has `
 `noise_model`, `method` and `trial`; one of a session has `arm`, `range_m`, `tilt_deg`, `robots` and more.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64, known_median
 from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.reconstruction.doubts.scene import (
@@ -593,7 +593,7 @@ def _scatter_of_pair(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[in
         weight = 1 / np.maximum(np.abs(left) / (1.5 * noise), 1.0)
     residual = np.full(shape, np.nan)
     residual.ravel()[used] = left
-    return float(1.48 * median(np.abs(residual - _median_of_rows(residual)[:, None])) / noise)
+    return float(1.48 * median(np.abs(residual - known_median(residual, 1)[:, None])) / noise)
 
 
 @cached
@@ -651,16 +651,6 @@ def _crossings(
                 noise2[count] += (_HALF_BODY_M * sigma[c, 2] / max(away, 1.0)) ** 2
             count += 1
     return used[:count], design[:count], apart[:count], noise2[:count]
-
-
-def _median_of_rows(values: Float) -> Float:
-    """Return the median of each row [T], NaN where nothing is finite; nanmedian is slow on small arrays."""
-    ordered = np.sort(values, axis=1)  # NaN last
-    count = np.isfinite(values).sum(axis=1)
-    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, values.shape[1] - 1)
-    row = np.arange(len(values))
-    middle: Float = np.where(count > 0, (ordered[row, low] + ordered[row, high]) / 2, np.nan)
-    return middle
 
 
 def _place(
