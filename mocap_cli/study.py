@@ -1,7 +1,5 @@
 """`mocap study`: how an error depends on what is varied."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from pathlib import Path
 

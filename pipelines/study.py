@@ -5,8 +5,6 @@ and triangulates by every method; errors are on the joint-frames that all method
 flies planner arms against its log with other settings, with the same draws. All figures are simulated.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -5,8 +5,6 @@ of several the one that overlaps in time with its film is taken, then the one of
 are listed as alternatives.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

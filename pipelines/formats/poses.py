@@ -4,8 +4,6 @@ TUM: `t x y z qx qy qz qw`, t in seconds; a line above the numbers may name anot
 ty tz qw qx qy qz`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -5,8 +5,6 @@ heel strikes when it is furthest ahead of the pelvis, and toes leave the ground 
 it. Where a skeleton has no heels and toes, its ankles replace them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

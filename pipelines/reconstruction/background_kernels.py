@@ -5,8 +5,6 @@ the array `band` [n, width] holds the entries (j, j), (j + 1, j), ... of its low
 in one thread and in a fixed order, so that the same input gives the same bytes.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

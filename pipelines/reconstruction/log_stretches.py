@@ -8,8 +8,6 @@ Positions and rotations are judged apart, as they come from different sensors.
 A camera that stands, or hovers, repeats no pose before a jump, and is left as it is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

@@ -7,8 +7,6 @@ poses and no stated noise, a view that disagrees shows a wrong joint, and the si
 meaning: its weight should fall with its residual.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

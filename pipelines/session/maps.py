@@ -8,8 +8,6 @@ One npz holds one grid. Any program may write one:
 - `from_ns`: the time from which the map holds; optional, 0.
 """
 
-from __future__ import annotations
-
 import math
 import zipfile
 import zlib

@@ -1,7 +1,5 @@
 """Reading of users' YAML files: into plain types, and into models with all problems in one message."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

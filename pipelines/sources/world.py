@@ -1,7 +1,5 @@
 """Conversion of logged poses to the world: to its clock, its axes (east-north-up) and its origin; doubts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

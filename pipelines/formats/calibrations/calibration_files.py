@@ -1,7 +1,5 @@
 """Calibrations of ROS, OpenCV, ORB-SLAM, camodocal, EasyMocap, Kalibr, and of anipose and its relatives."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence

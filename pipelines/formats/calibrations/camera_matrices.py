@@ -4,8 +4,6 @@ The centre of the top left pixel is (0, 0), as in OpenCV; readers of other files
 before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -5,8 +5,6 @@ its own with limits of time and memory, and writes the model again: what was rea
 COLMAP puts (0, 0) at the corner of the top left pixel: cx and cy lose half a pixel.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import subprocess

@@ -6,8 +6,6 @@ Reader (`CUSTOM.updateTime [local],OSD.flyTime [s],OSD.latitude,...,GIMBAL.pitch
 metres, often both. Angles are those of an FRD body and gimbal in NED.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence

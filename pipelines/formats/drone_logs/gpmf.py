@@ -8,8 +8,6 @@ packet are evenly spaced. A Karma logs `GLPI` (position), `ATTD` (roll, pitch, y
 (boot, UTC).
 """
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Iterator

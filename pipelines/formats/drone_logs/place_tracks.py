@@ -1,7 +1,5 @@
 """Places over time without attitudes: GPX tracks, and tables with latitude and longitude or x, y and z."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Each format is a line of a table: how its content is recognised, and how its people are gathered.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -3,8 +3,6 @@
 The mcap library parses the records. Its readers stop at the first damage, so this module walks the file.
 """
 
-from __future__ import annotations
-
 import struct
 from io import BytesIO
 

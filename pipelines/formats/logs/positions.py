@@ -1,7 +1,5 @@
 """Positions and attitudes in separate topics of a log, and axes that known programs give their poses."""
 
-from __future__ import annotations
-
 import re
 from array import array
 from collections.abc import Callable, Sequence

@@ -3,8 +3,6 @@
 This module is imported where it is used, because numba takes long to import.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

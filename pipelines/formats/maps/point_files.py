@@ -1,7 +1,5 @@
 """Point clouds (PCD, PLY, LAS, LAZ) as voxels: occupied with a point in them, else unknown."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections import Counter

@@ -1,7 +1,5 @@
 """Voxel grids: of point clouds, and of grids and floor plans that lie turned in the world."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 from abc import ABC, abstractmethod

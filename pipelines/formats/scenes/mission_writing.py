@@ -5,8 +5,6 @@ and north, east and down of setpoints, are relative to it. The nose of the drone
 Waypoints and setpoints keep the times of the flight. docs/outputs.md describes the files.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Pictures of a folder as a video: JPEG or PNG, numbered by their names, with the times of their EXIF."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

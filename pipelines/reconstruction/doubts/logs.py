@@ -1,7 +1,5 @@
 """Doubts that the logs of a flight's cameras raise by themselves, without any picture."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import combinations
 

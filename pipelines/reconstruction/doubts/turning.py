@@ -4,8 +4,6 @@ Rays of people agree with each other where all cameras are late alike: drones th
 error along. The background does not move, so it tells when each camera turned by itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

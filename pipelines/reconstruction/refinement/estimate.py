@@ -12,8 +12,6 @@ memory is therefore measured on each joint's residual relative to the other join
 of the error, see `memory_of_whole_error`.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

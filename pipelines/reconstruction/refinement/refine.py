@@ -1,7 +1,5 @@
 """Refinement of a whole flight: build the problem, find the prior, estimate, and check the result."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
