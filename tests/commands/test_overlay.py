@@ -165,6 +165,8 @@ def test_refined_poses_and_estimated_clocks_move_the_skeleton(
 
 
 def test_pictures_that_are_gone_or_others_and_no_skeleton(session: Path) -> None:
+    run = json.loads((session / "run.json").read_text())
+    (session / "run.json").write_text(json.dumps(run | {"folder": str(session)}))  # as if ingested here
     (session.parent / "drone1.mp4").unlink()
     notes = Notes()
     (video,) = export(session, ["overlay"], progress=notes).written
