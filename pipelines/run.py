@@ -64,11 +64,11 @@ def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[s
     manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
     if not must_be_drafted(manifest):
         return manifest, []
-    asked: list[Question] = []
+    open_keys: set[str] = set()
 
     def note_and_ask(question: Question) -> Answer | None:
         answer = ask(question)
-        asked.extend([question] if answer is None else [])
+        open_keys.update([question.key] if answer is None else [])
         return answer
 
     place = manifest.parent if manifest.exists() else folder
@@ -76,9 +76,8 @@ def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[s
     progress.note(f"{manifest}: drafted, with {len(found.cameras)} cameras")
     if found.missing:
         problem = f"was drafted and lacks {'; '.join(map(one_line, found.missing))}"
-        likely = ", or let --yes take the likely answers" if asked else ""
-        remedy = (
-            "add the file that has it, or write it where a comment marks the place, and run the same command"
-        )
+        answered = all(any(f"{key}: " in remark for key in open_keys) for remark in found.missing)
+        likely = ", or let --yes take the likely answers" if answered else ""
+        remedy = "add files that have it, or write it where comments mark the place, and run the same command"
         raise DataError(manifest, problem, f"{remedy} again{likely}", code="incomplete")
     return manifest, found.assumed

@@ -260,7 +260,8 @@ class _ManifestWriter:
     def _pose(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("pose")
         if choice is None:
-            remark = self.miss(camera, "pose", "nothing of that name has poses")
+            free = "nothing of that name has poses" if self.draft.free_poses else "no other file has poses"
+            remark = self.miss(camera, "pose", free)
             others = self.others("pose", self.draft.free_poses)
             return DraftedKey(None, [remark], others, example={"file": f"{camera.name}.tum"})
         taken, remarks = choice.taken, []
@@ -351,7 +352,8 @@ class _ManifestWriter:
             remark = self.assume(camera, "intrinsics", what)
             return DraftedKey(guess, [remark], self.others("intrinsics", self.draft.free_intrinsics))
         if choice is None:
-            remark = self.miss(camera, "intrinsics", "nothing of that name has them")
+            free = "nothing of that name has them" if self.draft.free_intrinsics else "no other file has them"
+            remark = self.miss(camera, "intrinsics", free)
             numbers = {"width": 1920, "height": 1080, "fx": 1400, "fy": 1400, "cx": 959.5, "cy": 539.5}
             others = self.others("intrinsics", self.draft.free_intrinsics)
             return DraftedKey(None, [remark], others, example=numbers)

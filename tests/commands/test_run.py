@@ -48,6 +48,7 @@ def test_what_only_the_user_knows_stops_it_with_the_draft_beside_the_data(tmp_pa
     flight.manifest.unlink()
     done = mocap("run", tmp_path)
     assert (done.returncode, done.code) == (1, "incomplete")
+    assert "--yes" not in done.stderr  # nothing is likely
     assert "missing: " in flight.manifest.read_text(encoding="utf-8")
     assert not flight.manifest.with_suffix(".session").exists()
 
@@ -84,7 +85,8 @@ def test_films_without_a_calibration_get_one_question_for_the_lens_of_all(tmp_pa
         asked.append(question)
         return Answer(1, stated=True)
 
-    assert draft([tmp_path]).missing
+    done = mocap("run", tmp_path)
+    assert (done.code, "--yes" in done.stderr) == ("incomplete", True)
     result = draft([tmp_path], overwrite=True, ask=second)
     assert not result.missing
     assert [(each.cameras, each.key) for each in asked] == [(("DJI_0001", "DJI_0031"), "intrinsics")]
