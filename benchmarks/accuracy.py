@@ -1,17 +1,11 @@
 """Accuracy of the estimate: `python -m benchmarks.accuracy SUBJECT [--write]`.
 
-- corpus: all methods on 24 rendered flights and the sample, with the real detectors
-  (`benchmarks/corpus/README.md`).
-- gimbals: real pictures that move, by virtual gimbals (`benchmarks/gimbals.py`).
-- bodies: bodies with a surface on the rendered flights (`benchmarks/bodies.py`).
-- people: several people, who is found and who is confused (`benchmarks/people.py`).
-- attitudes: attitudes from pictures where logs have places alone (`benchmarks/attitudes.py`).
-- detectors: the detectors on the sample and on a real recording, beside Pose2Sim (`benchmarks/detectors.py`).
-
-corpus: for each draw the errors of the logs are drawn anew. flight.yaml gives their true model, or neither it
-nor the logs give anything. Every method gets the same sessions by the same call as `mocap reconstruct`. "True
-poses" is `robust` with them. "Shared error" is `robust` with the true poses, moved and turned together by the
-error that all cameras of a draw share: no picture shows that error, so no method can remove it.
+SUBJECT is `corpus`, or gimbals, bodies, people, attitudes or detectors, each of which is described in the
+module of its name. corpus: all methods on 24 rendered flights and the sample, with the real detectors
+(`benchmarks/corpus/README.md`), errors of the logs drawn anew for each draw. flight.yaml gives their true
+model, or neither it nor the logs give anything. Every method gets the same sessions by the same call as
+`mocap reconstruct`. "True poses" is `robust` with them; "shared error" has them moved and turned together by
+the error that all cameras of a draw share: no picture shows that error, so no method can remove it.
 
 To save time, methods share the clocks that the first of them found by keypoints, and mistakes are searched
 for in the call alone whose time is taken. Results are kept in build/accuracy by the hash of the code and of

@@ -1,10 +1,8 @@
 """Attitudes from pictures on rendered flights: `python -m benchmarks.accuracy attitudes FOLDER`.
 
 Flights of the corpus are filmed again, and each camera is mapped once, by the same calls as `mocap ingest`
-with `pose.attitude: pictures`. Its true places are then disturbed many times, as two kinds of logs would:
-
-- rtk: white errors of 0.02 m beside a constant one;
-- gps: a Gauss-Markov error of 1.5 m with a correlation time of 100 s, a place a second.
+with `pose.attitude: pictures`. Its true places are then disturbed many times, as two kinds of logs (`LOGS`)
+would.
 
 `off` is the median over draws of the root mean square angle between found and true attitudes of key pictures.
 `NEES` is the mean squared common error over its predicted variance: 1 where the standard deviation is right.

@@ -28,10 +28,8 @@ TIMES = ROOT / "build" / "tests.xml"
 SAMPLE = ROOT / "demo" / "mound_walk.session"
 CONSTANTS_ARE = """\
 A constant is a number in capitals at the top of a module of pipelines/ or mocap_cli/, or a field of a frozen
-table (a frozen dataclass with numbers as most of its defaults). Its reason is the comment directly above it
-or behind it, or the text below it: a sentence with a capital letter first, at least four words, and a full
-stop at the end. A heading `# --- tuning ---` is no reason. In frozen tables and in pipelines/formats, numbers
-on consecutive lines share the comment above the first."""
+dataclass with numbers as most of its defaults. Its reason is the comment above or behind it, or the text
+below it: a sentence of four words or more. In such tables and in formats, consecutive lines share it."""
 
 
 @dataclass(frozen=True)

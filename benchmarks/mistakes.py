@@ -178,8 +178,8 @@ def expected_errors(folder: Path, seeds: Iterable[int]) -> list[str]:
         try:
             with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):
                 metrics = reconstruct(session, ReconstructSettings()).metrics
-        except DataError as error:
-            print(f"| {seed} | {geometry} | refused: {error.code} | | |", flush=True)
+        except DataError as refusal:
+            print(f"| {seed} | {geometry} | refused: {refusal.code} | | |", flush=True)
             continue
         low, median, high = metrics["verdict"]["expected_error_mm"]
         error, source = metrics["mpjpe_mm"], metrics["method_used"]["pose_noise"]

@@ -3,17 +3,13 @@
 Three drones with GPS of 0.1 m circle the first person; keypoints have the measured errors of the detector,
 and a joint behind another person's body is hidden. Each scene is reconstructed with `--persons auto`, once
 with everybody's log and once with none. Alone is the MPJPE of the first person in a flight of the same seed
-in which nobody else is. Seeds 0 to 4 and 30 to 33 were looked at while the rules were made.
-
-`--films FOLDER` films the scenes instead (rendered, 640x360 px, among trees): the real detector finds the
-people. Films stay in the folder, and an interrupted run continues.
+in which nobody else is. Seeds 0 to 4 and 30 to 33 were looked at while the rules were made. `--films FOLDER`
+films the scenes instead (rendered, 640x360 px, among trees): the real detector finds the people.
 
 Seen: times at which two cameras or more see at least half of the joints of a true person. Coverage is the
 share of these at which somebody reconstructed is within 0.5 m of them. Detected is the share of these at
 which two cameras or more have a detection of the person: the median over its joints is within 0.25 m of the
-true ones, at the person's distance, and nobody else is nearer.
-Switches, phantoms (times), MOTA, IDF1 and MPJPE (mm) are those of metrics.json. At `nobody` a body is more
-than 1 m from everybody.
+true ones, at the person's distance, and nobody else is nearer. All else is that of metrics.json.
 """
 
 import argparse

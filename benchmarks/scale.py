@@ -64,16 +64,21 @@ def flown(seed: int, seconds: float, place: Path) -> Path:
 
 def commands(minutes: float) -> Iterator[list[str]]:
     """Run the commands of a session of so many minutes; yield command, peak MB and processor seconds."""
-    mocap = str(Path(sys.executable).with_name("mocap"))
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
         session = ingest(flown(300, 60 * minutes, Path(folder)), Path(folder) / "long.session").folder
         for command, *options in COMMANDS:
-            asked = [sys.executable, "-c", _MEASURED, mocap, command, str(session), *options]
-            done = subprocess.run(asked, stdout=subprocess.PIPE, check=True)  # noqa: S603
-            code, peak_kib, took_s = json.loads(done.stdout)
-            if code:
-                raise SystemExit(f"mocap {command} ended with {code}")
-            yield [f"{minutes:g}", command, fixed(peak_kib * 1024 / 1e6), fixed(took_s)]
+            yield [f"{minutes:g}", command, *map(fixed, cost_of(command, str(session), *options))]
+
+
+def cost_of(command: str, *options: str) -> tuple[float, float]:
+    """Run a command of `mocap`; return its peak memory (MB) and processor time (s)."""
+    mocap = str(Path(sys.executable).with_name("mocap"))
+    asked = [sys.executable, "-c", _MEASURED, mocap, command, *options]
+    done = subprocess.run(asked, stdout=subprocess.PIPE, check=True)  # noqa: S603
+    code, peak_kib, took_s = json.loads(done.stdout)
+    if code:
+        raise SystemExit(f"mocap {command} ended with {code}")
+    return peak_kib * 1024 / 1e6, took_s
 
 
 def accuracy(seed: int) -> Iterator[list[str]]:

@@ -16,7 +16,6 @@ another machine (2,250 frames of the same kind of walk, five cameras, true poses
 import json
 import os
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -33,6 +32,7 @@ import yaml  # type: ignore[import-untyped]
 
 from benchmarks.flights import SAMPLE
 from benchmarks.results import markdown_table, parser_of, show
+from benchmarks.scale import cost_of
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import pose_errors
 from pipelines.geometry.triangulation import Views, estimate_noise, triangulate
@@ -261,7 +261,6 @@ def renderer() -> Iterator[Row]:
 
 def sample() -> Iterator[Row]:
     """Time the commands on the sample flight, each in a process of its own."""
-    mocap = str(Path(sys.executable).with_name("mocap"))
     with tempfile.TemporaryDirectory(prefix="speed-") as folder:
         session = str(Path(folder) / "sample.session")
         for command, *options in (
@@ -270,16 +269,7 @@ def sample() -> Iterator[Row]:
             ("replan-compare", session),
             ("report", session),
         ):
-            before_s = _children_s()
-            asked = [mocap, command, *options]
-            quiet = subprocess.DEVNULL
-            subprocess.run(asked, check=True, stdout=quiet, stderr=quiet)  # noqa: S603
-            yield f"`mocap {command}` of the sample", f"{_children_s() - before_s:.1f} s", ""
-
-
-def _children_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+            yield f"`mocap {command}` of the sample", f"{cost_of(command, *options)[1]:.1f} s", ""
 
 
 SUBJECTS: dict[str, Callable[[], Iterator[Row]]] = {

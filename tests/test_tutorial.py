@@ -28,10 +28,7 @@ def steps_of(page: str) -> list[Step]:
     output = r"(?:\n*```text\n(?P<shown>(?:(?!```).*\n)*)```\n)?"
     found = re.finditer(f"(?:{shell}|{python}){output}", page, re.MULTILINE)
     return [
-        Step(
-            each["shell"] or f"python - <<'END'\n{each['python']}END\n",
-            (each["shown"] or "").splitlines(),
-        )
+        Step(each["shell"] or f"python - <<'END'\n{each['python']}END\n", (each["shown"] or "").splitlines())
         for each in found
     ]
 

@@ -1,9 +1,8 @@
 """Files of the corpus: one folder for each flight, with what took hours to make.
 
-`tuning/` and `kept/` hold a folder for each flight: its scenario, the keypoints of both detectors in its
-pictures, and the background: its tracks, and some
-stills. Pixels are rounded (0.1 px for keypoints, 0.05 px for tracks).
-Everything else is made again from the scenario in seconds (`benchmarks.corpus.drawn`).
+`tuning/` and `kept/` hold a folder for each flight: its scenario, the keypoints of both detectors, and the
+background's tracks and some stills, in rounded pixels. Everything else is made again from the scenario in
+seconds (`benchmarks.corpus.drawn`).
 """
 
 import json

@@ -172,11 +172,7 @@ def exchange(session: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command",
-    [
-        ("report", "--force", "--figures", "figures"),
-        ("export", "--to", "mcap", "-o", "exported"),
-    ],
+    "command", [("report", "--force", "--figures", "figures"), ("export", "--to", "mcap", "-o", "exported")]
 )
 def test_every_command_that_reads_pictures_refuses_others(
     filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]

@@ -62,10 +62,7 @@ def test_files_written_in_parts_are_those_written_at_once(
     """Write 12 frames in parts of 5, the last of them of 2."""
     at_once, parts = tmp_path / "at_once", tmp_path / "parts"
     export(filmed, ["trc", "csv", "tum"], at_once)
-    for module, name in (
-        (trc, "_FRAMES_AT_ONCE"),
-        (joint_files, "_TIMES_AT_ONCE"),
-    ):
+    for module, name in ((trc, "_FRAMES_AT_ONCE"), (joint_files, "_TIMES_AT_ONCE")):
         monkeypatch.setattr(module, name, 5)
     export(filmed, ["trc", "csv", "tum"], parts)
     assert content(parts) == content(at_once)
@@ -131,12 +128,7 @@ def test_c3d_is_truth(tmp_path: Path) -> None:
     since_start = JointMotion(flight.t_ns - START_NS, flight.joints, flight.position[:, None])
     even = at_even_times("x", since_start, Silent())
     c3d.write_joints(tmp_path / "truth.c3d", even, 0, unit="cm", axes="y-up")
-    flight.settings["truth"] = {
-        "file": "truth.c3d",
-        "unit": "cm",
-        "up": "y",
-        "offset_s": START_NS // 10**9,
-    }
+    flight.settings["truth"] = {"file": "truth.c3d", "unit": "cm", "up": "y", "offset_s": START_NS // 10**9}
     flight.save()
     succeeds("ingest", flight.manifest)
     table = pd.read_parquet(tmp_path / "flight.session" / "truth.parquet")

@@ -52,11 +52,7 @@ def write_lenses(flight: SyntheticFlight) -> None:
 
 @pytest.mark.parametrize(
     ("keypoints", "poses", "static"),
-    [
-        ("alphapose", "tum", False),
-        ("openpose", "csv", False),
-        ("coco", "tum", True),
-    ],
+    [("alphapose", "tum", False), ("openpose", "csv", False), ("coco", "tum", True)],
 )
 def test_drafted_flights_are_ingested_as_they_were_written(
     tmp_path: Path, keypoints: str, poses: str, static: bool
@@ -169,12 +165,7 @@ def test_files_that_cannot_be_read_are_listed_and_left_out(tmp_path: Path) -> No
     assert " JSON (" in reasons["drone2.json"]
 
 
-HOSTILE = [
-    "true",
-    "x\n  pose: {file: y}\n",
-    "bell\x07 'single' \"double\" \\",
-    "line\u2028separator",
-]
+HOSTILE = ["true", "x\n  pose: {file: y}\n", "bell\x07 'single' \"double\" \\", "line\u2028separator"]
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -34,11 +34,7 @@ def utm(latitude_deg: float, longitude_deg: float, central_deg: float = CENTRAL_
     phi, away = np.radians(latitude_deg), np.radians(longitude_deg - central_deg)
     t = np.sinh(np.arctanh(np.sin(phi)) - e * np.arctanh(e * np.sin(phi)))
     xi, eta = np.arctan2(t, np.cos(away)), np.arctanh(np.sin(away) / np.sqrt(1 + t * t))
-    series = (
-        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16,
-        13 * n**2 / 48 - 3 * n**3 / 5,
-        61 * n**3 / 240,
-    )
+    series = (n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16, 13 * n**2 / 48 - 3 * n**3 / 5, 61 * n**3 / 240)
     north, east = xi, eta
     for k, h in enumerate(series, 1):
         north += h * np.sin(2 * k * xi) * np.cosh(2 * k * eta)
@@ -187,8 +183,7 @@ def test_a_map_far_from_all_cameras_is_doubted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("own", "stated", "apart_m"),
-    [(32617, None, None), (32617, "EPSG:26917", None), (32618, ZONE, 500_000.0)],
+    ("own", "stated", "apart_m"), [(32617, None, None), (32617, "EPSG:26917", None), (32618, ZONE, 500_000.0)]
 )
 def test_the_crs_in_a_cloud_places_it_unless_another_is_stated(
     tmp_path: Path, own: int, stated: str | None, apart_m: float | None

@@ -366,8 +366,7 @@ def test_every_method_is_served_by_the_clocks_that_were_found(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("cameras", "late_s", "within_s"),
-    [(3, {"drone2": -0.05}, 0.005), (2, {"drone2": 0.2}, 0.02)],
+    ("cameras", "late_s", "within_s"), [(3, {"drone2": -0.05}, 0.005), (2, {"drone2": 0.2}, 0.02)]
 )
 def test_a_stated_clock_that_is_wrong_is_moved_and_doubted(
     tmp_path: Path, cameras: int, late_s: dict[str, float], within_s: float

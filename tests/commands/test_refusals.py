@@ -152,12 +152,7 @@ USUAL_MISTAKES: list[tuple[str, Any, str, list[str]]] = [
     ("world.frame", "nedd", "bad-value", ["world.frame: ", "'ned'"]),
     ("cameras", {}, "bad-value", ["cameras: "]),
     ("map", "site.bt", "no-such-file", ["site.bt"]),
-    (
-        "drone1.gimbal",
-        {"file": "a.mcap", "topic": "/g"},
-        "bad-value",
-        ["relative_to"],
-    ),
+    ("drone1.gimbal", {"file": "a.mcap", "topic": "/g"}, "bad-value", ["relative_to"]),
     ("clock_reference", "drone4", "bad-value", ["clock_reference: 'drone4'", "'drone"]),
     ("truth.poses", {"dron1": "drone1_true.tum"}, "bad-value", ["truth.poses: 'dron1'", "'drone1'"]),
     ("drone1.frame_times.start", 12.5, "no-overlap", ["frame_times.start: 1699999", "clock: {offset_s"]),

@@ -384,10 +384,7 @@ def test_what_a_map_lacks_about_the_ways_is_said(calm: Path) -> None:
 
 
 BAD = {
-    "unknown arm": (
-        ["--arms", "adaptive,clever"],
-        "there are adaptive, fixed, group, joint, flown",
-    ),
+    "unknown arm": (["--arms", "adaptive,clever"], "there are adaptive, fixed, group, joint, flown"),
     "unknown noise": (["--pose-noise", "pink:position_m=1"], "pink"),
     "out of range": (["--config", "horizon_s=600"], "horizon_s"),
 }
@@ -494,10 +491,7 @@ def with_plan(flight: Path, name: str, **plan: Any) -> Path:
 
 def test_what_was_commanded_is_an_arm_like_the_others(flown: Path, tmp_path: Path) -> None:
     manifest = with_plan(
-        flown,
-        "planned",
-        drone1={"file": "planner.mcap", "topic": "/drone1/setpoint"},
-        drone2="drone2.tum",
+        flown, "planned", drone1={"file": "planner.mcap", "topic": "/drone1/setpoint"}, drone2="drone2.tum"
     )
     session = tmp_path / "planned.session"
     succeeds("ingest", manifest, "-o", session)

@@ -199,10 +199,7 @@ def test_every_person_is_in_the_truth_the_keypoints_and_the_log(two: Path) -> No
     assert read_yaml(two)["actors"] == {
         name: {"file": "drone1", "topic": f"/actor/{name}", "point": "hip"} for name in ("anna", "ben")
     }
-    assert list(result_of("info", folder / "scenario.yaml")["readings"][0]["actors"]) == [
-        "anna",
-        "ben",
-    ]
+    assert list(result_of("info", folder / "scenario.yaml")["readings"][0]["actors"]) == ["anna", "ben"]
 
 
 def test_everybody_reconstructed_is_compared_with_their_own_truth(tmp_path: Path) -> None:

@@ -114,16 +114,7 @@ def test_a_detector_and_a_noise_model_are_used_and_an_export_written(outside: Pa
 
 
 def test_an_arm_is_compared(outside: Path, session: Path) -> None:
-    _mocap(
-        outside,
-        "replan-compare",
-        session,
-        "--arms",
-        "fixed,opposite",
-        "--trials",
-        "1",
-        "-q",
-    )
+    _mocap(outside, "replan-compare", session, "--arms", "fixed,opposite", "--trials", "1", "-q")
     arms = {
         name: pd.read_parquet(session / "replan" / name / "trajectories.parquet")
         for name in ("fixed", "opposite")

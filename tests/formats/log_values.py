@@ -9,10 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from pipelines.session.records import Message, Topic
 
-STORES = {
-    "ros1": get_typestore(Stores.ROS1_NOETIC),
-    "ros2": get_typestore(Stores.ROS2_HUMBLE),
-}
+STORES = {"ros1": get_typestore(Stores.ROS1_NOETIC), "ros2": get_typestore(Stores.ROS2_HUMBLE)}
 
 
 def message(

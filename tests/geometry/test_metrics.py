@@ -80,9 +80,7 @@ def test_a_hip_joint_is_the_root_and_does_not_dilute_the_mean() -> None:
 
 
 @given(
-    shift=st.tuples(*[st.floats(-2, 2)] * 3),
-    turn=st.tuples(*[st.floats(-1, 1)] * 3),
-    scale=st.floats(0.5, 2),
+    shift=st.tuples(*[st.floats(-2, 2)] * 3), turn=st.tuples(*[st.floats(-1, 1)] * 3), scale=st.floats(0.5, 2)
 )
 def test_each_metric_is_blind_to_what_it_removes(
     shift: tuple[float, float, float], turn: tuple[float, float, float], scale: float

@@ -224,11 +224,7 @@ def rotation_of(vector: tuple[float, float, float]) -> Float:
     count=st.integers(3, 20),
 )
 def test_a_known_similarity_is_found(
-    seed: int,
-    vector: tuple[float, float, float],
-    scale: float,
-    shift: tuple[float, float, float],
-    count: int,
+    seed: int, vector: tuple[float, float, float], scale: float, shift: tuple[float, float, float], count: int
 ) -> None:
     source = cloud(count, seed)
     rotation = rotation_of(vector)

@@ -58,12 +58,7 @@ def heatmap_model(
 
 
 def simcc_model(
-    path: Path,
-    *,
-    size: tuple[int, int] = (96, 128),
-    joints: int = 17,
-    split: int = 2,
-    batch: int | str = "n",
+    path: Path, *, size: tuple[int, int] = (96, 128), joints: int = 17, split: int = 2, batch: int | str = "n"
 ) -> Path:
     """Build a SimCC model: bin b is the smoothed sum of columns, or rows, around b / split, over 16."""
     width, height = size

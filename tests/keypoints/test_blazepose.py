@@ -193,8 +193,7 @@ def test_joints_outside_of_the_crop_have_no_confidence(networks: BlazePose, samp
 
 
 @pytest.mark.parametrize(
-    ("top", "angle"),
-    [((50, 0), 0.0), ((90, 40), np.pi / 2), ((50, 80), np.pi), ((10, 40), -np.pi / 2)],
+    ("top", "angle"), [((50, 0), 0.0), ((90, 40), np.pi / 2), ((50, 80), np.pi), ((10, 40), -np.pi / 2)]
 )
 def test_a_region_is_turned_as_its_person(top: tuple[float, float], angle: float) -> None:
     region = blazepose._region(np.array([50.0, 40.0]), np.array(top, float))

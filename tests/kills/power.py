@@ -310,10 +310,7 @@ def _visible(folder: Path) -> dict[str, str]:
 
 
 def _of_session(
-    name: str,
-    session: Path,
-    arguments: Sequence[str | Path],
-    before: Callable[[], object] = lambda: None,
+    name: str, session: Path, arguments: Sequence[str | Path], before: Callable[[], object] = lambda: None
 ) -> Case:
     version, files = partial(version_of_session, session), partial(_files_beside, session)
     return Case(name, arguments, version, files, before)

@@ -347,13 +347,7 @@ def fly(
     drones: int = 2,
     yaw_deg: float = 45.0,
 ) -> Replay:
-    return replay(
-        arm,
-        *walker(seconds),
-        [field],
-        Start(drones, np.radians(yaw_deg)),
-        config=config,
-    )
+    return replay(arm, *walker(seconds), [field], Start(drones, np.radians(yaw_deg)), config=config)
 
 
 def tilt_deg(result: Replay) -> Float:

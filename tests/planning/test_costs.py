@@ -81,11 +81,7 @@ def slab(*, unknown_above: bool = False) -> Occupancy:
     return Occupancy(probability, np.array([-2.0, -2.0, 0.0]), RES, from_ns=7)
 
 
-@given(
-    st.floats(-5, 5),
-    st.floats(-5, 5),
-    st.floats(RES / 2, 4 - RES / 2),
-)
+@given(st.floats(-5, 5), st.floats(-5, 5), st.floats(RES / 2, 4 - RES / 2))
 def test_a_flat_surface_is_exact(x: float, y: float, z: float) -> None:
     """Plus and minus half a voxel put the surface at z = 1 on both sides, linear between all centres."""
     distance, gradient = distance_field(slab()).sample(np.array([x, y, z]))

@@ -98,11 +98,7 @@ def turns_deg(one: Float, other: Float) -> Float:
 
 
 def adjusted(
-    picture: Int64,
-    point: Int64,
-    xy: Float,
-    logged_poses: tuple[Float, Float],
-    prior: PosePrior = PRIOR,
+    picture: Int64, point: Int64, xy: Float, logged_poses: tuple[Float, Float], prior: PosePrior = PRIOR
 ) -> Adjusted:
     """Adjust poses of pictures 30 times a second."""
     t_s = np.arange(len(logged_poses[0])) / 30

@@ -95,9 +95,7 @@ def camera(
     return (
         made,
         Followed(
-            np.arange(PICTURES),
-            np.zeros(1, np.int64),
-            [lambda: Tracks(picture, point, xy[picture, point])],
+            np.arange(PICTURES), np.zeros(1, np.int64), [lambda: Tracks(picture, point, xy[picture, point])]
         ),
         Stills(rows, [filmed(position[r], rotation[r], ground) for r in rows].__getitem__),
     )

@@ -139,8 +139,6 @@ def test_poses_are_not_made_up_in_pauses_of_the_log() -> None:
     np.testing.assert_allclose(table["x"], [0, 1, 2, 12, 13])
 
     still = replace(
-        drone,
-        static=True,
-        trajectory=Trajectory(log.t_ns[:1], position[:1], log.quaternion_xyzw[:1]),
+        drone, static=True, trajectory=Trajectory(log.t_ns[:1], position[:1], log.quaternion_xyzw[:1])
     )
     assert len(camera_poses_table([still], Interpolation(max_gap_s=1.5, max_extrapolation_s=0.0))) == 16

@@ -145,8 +145,5 @@ def make_comparison(*arms: str, verdict: str = "adaptive is better") -> ReplanCo
     table = pd.DataFrame({"t_ns": stamps(), "person": 0})
     table[["x", "y", "z"]] = actor()
     return ReplanContent(
-        metrics=metrics,
-        arms={arm: make_arm(arm) for arm in arms},
-        actor=table[ACTOR.names],
-        map=make_map(),
+        metrics=metrics, arms={arm: make_arm(arm) for arm in arms}, actor=table[ACTOR.names], map=make_map()
     )

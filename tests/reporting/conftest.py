@@ -194,12 +194,7 @@ def make_session(frames: int = FRAMES, rate_hz: float = RATE_HZ) -> dict[str, ob
     cameras: dict[str, object] = {
         name: {
             "intrinsics": INTRINSICS,
-            "frames": {
-                "count": frames,
-                "first_t_ns": START_NS,
-                "last_t_ns": last,
-                "rate_hz": float(rate_hz),
-            },
+            "frames": {"count": frames, "first_t_ns": START_NS, "last_t_ns": last, "rate_hz": float(rate_hz)},
             "poses": {
                 "source": f"{name}.tum",
                 "static": name == "mast",

@@ -14,12 +14,7 @@ import pipelines.report
 from pipelines.geometry.metrics import RESAMPLES, STRETCH_S
 from pipelines.report import compare_sessions
 from pipelines.reporting.content import SessionContent, StudyContent
-from pipelines.reporting.session_comparison import (
-    compare,
-    draw_comparison,
-    lead,
-    render_comparison,
-)
+from pipelines.reporting.session_comparison import compare, draw_comparison, lead, render_comparison
 from pipelines.reporting.studies import METRICS, draw_study, study_blocks, tables
 from pipelines.reporting.wording import Table
 from pipelines.session.errors import DataError

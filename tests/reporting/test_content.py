@@ -21,14 +21,7 @@ from pipelines.reporting.overlays import collect_moments
 from pipelines.reporting.pictures import make_strips
 from pipelines.reporting.summary import Verdict, give_verdict, summarise, truth_at
 from pipelines.reporting.viewer import make_scene
-from pipelines.reporting.wording import (
-    STATUS_REASONS,
-    STATUS_REMEDIES,
-    THIN,
-    cell_text,
-    joint_label,
-    percent,
-)
+from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, THIN, cell_text, joint_label, percent
 
 from .conftest import ASIDE_PX, CAMERAS, FRAMES, JOINTS, OFFSET_M, STAGES, make_skeleton, make_truth, statuses
 from .reading import numbers, one

@@ -72,9 +72,7 @@ def _only(joint: int) -> NDArray[np.float64]:
 def test_keypoints_are_rings_and_lost_ones_crosses(view: OverlayView) -> None:
     flags = np.eye(4, dtype=np.bool_)
     drawn = draw_frame(
-        GROUND,
-        replace(view, reprojected=MISSING, found=BODY, rejected=flags[[1]], unmeasured=flags[[2]]),
-        (),
+        GROUND, replace(view, reprojected=MISSING, found=BODY, rejected=flags[[1]], unmeasured=flags[[2]]), ()
     )
     for joint, colour in ((0, FOUND), (1, REJECTED), (2, UNMEASURED), (3, FOUND)):
         x, y = BODY[0, joint].astype(int)

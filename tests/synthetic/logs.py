@@ -212,10 +212,7 @@ def _register(writer: McapWriter, type_: str, encoding: Encoding) -> int:
 
 
 # Enough of Foxglove's schemas for the one type that JSON alone cannot express.
-JSON_SCHEMA = {
-    "type": "object",
-    "properties": {"data": {"type": "string", "contentEncoding": "base64"}},
-}
+JSON_SCHEMA = {"type": "object", "properties": {"data": {"type": "string", "contentEncoding": "base64"}}}
 
 
 def _json(entry: Entry) -> bytes:

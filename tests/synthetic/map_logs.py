@@ -58,12 +58,7 @@ def as_bt(occupancy: Occupancy, folder: Path) -> bytes:
 
 
 def grid_entry(
-    cells: NDArray[np.int8],
-    stamp_ns: int,
-    *,
-    origin: Pose = AT_REST,
-    frame: str = "map",
-    topic: str = "/map",
+    cells: NDArray[np.int8], stamp_ns: int, *, origin: Pose = AT_REST, frame: str = "map", topic: str = "/map"
 ) -> Entry:
     """Build the message of a floor plan of cells [X, Y]."""
     position, quaternion = origin

@@ -112,11 +112,7 @@ def test_a_cut_file_gives_its_beginning(tmp_path: Path, compression: McapCompres
         assert path.stat().st_size < 5_000 + 10_000
         return
     assert found == ALL[: len(found)]
-    assert dropped.keys() <= {
-        TRUNCATED,
-        UNCLOSED,
-        TAIL,
-    }
+    assert dropped.keys() <= {TRUNCATED, UNCLOSED, TAIL}
     assert (TRUNCATED in dropped) != (UNCLOSED in dropped)
     if compression == "none":
         # 5 kB come before the first message, 5 kB of summary after the last; the cut costs up to 3 messages.

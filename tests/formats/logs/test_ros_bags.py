@@ -101,10 +101,7 @@ def test_a_missing_part_costs_its_messages_and_is_said(tmp_path: Path) -> None:
     (path / "flight_1.db3").unlink()
     found, dropped = everything(path)
     assert found == ALL[:40] + ALL[80:]
-    assert dropped == {
-        MISSING_FILES: 1,
-        NOT_IN_FILES: 40,
-    }
+    assert dropped == {MISSING_FILES: 1, NOT_IN_FILES: 40}
 
 
 def test_metadata_cannot_name_files_outside_the_bag(tmp_path: Path) -> None:
@@ -132,11 +129,7 @@ def test_a_cut_ros1_bag_gives_its_beginning(
         assert path.stat().st_size < 4117 + 10_000
         return
     assert found == ALL[: len(found)]
-    assert dropped.keys() <= {
-        TRUNCATED,
-        TAIL,
-        UNCLOSED,
-    }
+    assert dropped.keys() <= {TRUNCATED, TAIL, UNCLOSED}
     assert (TRUNCATED in dropped) != (UNCLOSED in dropped)
     if compression == "none":
         # At the cut at most a message of 2.1 kB, an index and a connection can be lost.

@@ -225,11 +225,7 @@ def blocked(world_parts: Mapping[str, object], eye: list[float], target: list[fl
 def test_lines_that_graze_a_mound() -> None:
     """Level lines over the top of a mound 2 m high: hidden below 2 m - 2 GRAZE, seen above 2 m - GRAZE."""
     mound = {"mounds": [{"centre": [0.3, 0.0], "sigma_m": [2.0, 3.0], "height_m": 2.0}]}
-    for height, hides in (
-        (2 - 2 * GRAZE_M - TINY, True),
-        (2 - GRAZE_M + TINY, False),
-        (2 + TINY, False),
-    ):
+    for height, hides in ((2 - 2 * GRAZE_M - TINY, True), (2 - GRAZE_M + TINY, False), (2 + TINY, False)):
         for bearing in np.linspace(0, np.pi, 8):
             for reach in (7.0, 40.0):
                 x, y = reach * np.cos(bearing), reach * np.sin(bearing)
