@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations, product
+from functools import cached_property, partial
+from itertools import chain, permutations, product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,11 +49,11 @@ _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures
 _SIZE_FACTORS = (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3)  # pictures that a detector was given enlarged or reduced
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
 # Cameras film at these rates, or at 1000/1001 of them, but for rounding.
-_USUAL_RATES_HZ, _SAME_RATE = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 100.0, 120.0, 240.0), 2e-3
+_USUAL_RATES_HZ, _SAME_RATE = (24.0, 25.0, 30.0, 50.0, 60.0), 2e-3
 # Of the pictures of a detector few are looked at, so other rates than these may be right.
 _PRICE_OF_UNUSUAL_RATE = 1.0
-# A rate that leaves few pictures to disagree is dearer by this, times the share of pictures that it loses.
-_PRICE_OF_LOST = 2.0
+# Logs go on about as long as pictures: a rate pays this, times the share of logs that it leaves unfilmed.
+_PRICE_OF_UNFILMED = 3.0
 # A stated error is questioned beyond so many of its standard deviations: errors have heavy tails.
 _LEAST_SIGMAS = 5.0
 # Smaller faults do not matter beside the errors of good poses, whatever is stated of these.
@@ -86,7 +88,6 @@ class Numbers:
 
     make: Callable[[Float], SceneOfMoments]
     starts: Float  # [K, n]; the fit begins at the best of them
-    expected: Sequence[float]  # [n] standard deviations before the pictures are seen
     said: Callable[[Float, Float], Alternative | None]  # of numbers [n] and their covariance [n, n]
 
 
@@ -117,17 +118,11 @@ class Trial:
             yield list(members), 0.5
         yield from (([index], 0.5 + dearer) for index in members)
 
-    def turned(self, group: Sequence[int], turn: Callable[[int, Float], Float]) -> SceneOfMoments:
-        """Turn the attitudes [T, 3, 3] of cameras."""
-        rotation = self.described.rotation.copy()
-        for index in group:
-            rotation[index] = turn(index, rotation[index])
-        return replace(self.described, rotation=rotation)
-
-    def mount(self, index: int) -> Float:
-        """Return body_from_camera [3, 3] of a camera; looking forwards where it is not fixed to a body."""
-        stored = self.cameras[index].mount
-        return _FLU_FROM_OPTICAL if stored is None else stored
+    @cached_property
+    def mounts(self) -> Float:
+        """Return body_from_camera [C, 1, 3, 3]; looking forwards where a camera is not fixed to a body."""
+        stored = [camera.mount for camera in self.cameras]
+        return np.array([_FLU_FROM_OPTICAL if each is None else each for each in stored])[:, None]
 
     def with_times(self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0) -> SceneOfMoments:
         """Add seconds to the times of cameras' pictures, and let them follow each other more slowly."""
@@ -159,25 +154,31 @@ def rates(trial: Trial) -> Iterator[Alternative]:
     for group, price in trial.groups(trial.every):
         whose = "all cameras" if len(group) == len(trial.names) else trial.names[group[0]]
         stated_hz = remedies.rate_hz(trial.cameras[group[0]])
-        for factor in RATES:
-            usual = min(abs(stated_hz / factor / each - 1) for each in _USUAL_RATES_HZ) < _SAME_RATE
-            scene = trial.with_times(group, slower=factor)
-            dearer = _PRICE_OF_LOST * (1 - _looked_at(scene) / max(_looked_at(trial.described), 1))
+        usual = _is_usual(stated_hz)
+        others = (hz for hz in _USUAL_RATES_HZ if abs(stated_hz / hz - 1) > _SAME_RATE)
+        for factor in (stated_hz / hz for hz in others) if usual else RATES:
+            unfilmed = [_unfilmed(trial.cameras[k], factor) - _unfilmed(trial.cameras[k]) for k in group]
+            dearer = _PRICE_OF_UNFILMED * float(np.mean(unfilmed))
             yield Alternative(
                 "frame_rate",
                 trial.named(group, of_pair=True),
                 f"the frame rate of {whose} is {remedies.times_faster(factor)}",
                 remedies.frame_rate(trial.cameras, group, factor),
-                price + max(0.0, dearer) + (0.0 if usual else _PRICE_OF_UNUSUAL_RATE),
-                scene,
+                price + max(0.0, dearer) + _PRICE_OF_UNUSUAL_RATE * (not _is_usual(stated_hz / factor)),
+                trial.with_times(group, slower=factor),
                 alike=len(group) == len(trial.names),
             )
 
 
-def _looked_at(scene: SceneOfMoments) -> int:
-    """Count the pictures of moments that show somebody, and of which a pose is known."""
-    posed = np.isfinite(scene.position).all(axis=-1)
-    return int((np.isfinite(scene.rays[..., 0]).any(axis=-1) & posed).sum())
+def _is_usual(rate_hz: float) -> bool:
+    return min(abs(rate_hz / usual - 1) for usual in _USUAL_RATES_HZ) < _SAME_RATE
+
+
+def _unfilmed(camera: Filmed, slower: float = 1.0) -> float:
+    """Return the share of a camera's log after its last picture; of one that stands still, of its film."""
+    first, last = camera.entry.frames.first_t_ns, camera.entry.frames.last_t_ns
+    begin, end = (first, last) if camera.static else camera.camera.trajectory.t_ns[[0, -1]]
+    return float(max(0, end - first - (last - first) * slower) / max(end - begin, 1))
 
 
 def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
@@ -268,10 +269,16 @@ def scale(trial: Trial, stature: float) -> Alternative:
 def discrete(trial: Trial) -> Iterator[Alternative]:
     """Try exchanged pictures, other mounts and gimbals, other conventions, and other keypoints."""
     yield from _exchanged_pictures(trial)
-    yield from _mounts(trial)
-    yield from _gimbals(trial)
-    if trial.moving:
-        yield from _conventions(trial)
+    scene = trial.described
+    for row in chain(_mounts(trial), _gimbals(trial), _conventions(trial)) if trial.moving else ():
+        group = trial.moving if row.group is None else row.group
+        rotation, position = scene.rotation.copy(), scene.position.copy()
+        rotation[group] = row.rotation[group]
+        if row.position is not None:
+            position[group] = row.position[group]
+        named = trial.names if row.group is None else trial.named(group)
+        posed = replace(scene, rotation=rotation, position=position)
+        yield Alternative(row.code, named, row.what, row.remedy, row.price, posed, row.same_scatter)
     yield from _keypoints(trial)
     for factor in _FOCAL_FACTORS:
         yield Alternative(
@@ -279,9 +286,22 @@ def discrete(trial: Trial) -> Iterator[Alternative]:
             trial.names,
             f"the focal length of every camera is {factor:.3g} times what is stated",
             remedies.intrinsics(trial.cameras, trial.every, factor),
-            0.5,
-            changed(trial.described, "focal", trial.every, np.log([factor])),
+            PRICE_OF_ALL + np.log(len(_FOCAL_FACTORS)) / 2,
+            changed(scene, "focal", trial.every, np.log([factor])),
         )
+
+
+class Posed(NamedTuple):
+    """A row of the table of other poses."""
+
+    code: str
+    what: str
+    remedy: str
+    rotation: Float  # [C, T, 3, 3] world_from_camera; those of the group are taken
+    position: Float | None = None  # [C, T, 3]; None as described
+    group: Sequence[int] | None = None  # None for all moving cameras
+    price: float = PRICE_OF_ALL
+    same_scatter: bool = False
 
 
 def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
@@ -300,47 +320,26 @@ def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
             )
 
 
-def _mounts(trial: Trial) -> Iterator[Alternative]:
+def _mounts(trial: Trial) -> Iterator[Posed]:
     """Try cameras that are rolled, or look another way, by right angles, and the other sign of tilts."""
+    rotation, cameras, mounts = trial.described.rotation, trial.cameras, trial.mounts
     for (group, price), degrees in product(trial.groups(trial.moving), (90, 180, 270)):
-        turn, side = turn_about("z", degrees), "left" if degrees <= 180 else "right"
+        turn, whose = turn_about("z", degrees), trial.whose(group)
         signed = degrees if degrees <= 180 else degrees - 360
-        whose = f"{trial.whose(group)} is"
-        yield Alternative(
-            "mount",
-            trial.named(group),
-            f"{whose} rolled by {signed} deg about the optical axis",
-            remedies.mount(trial.cameras, group, lambda mount, turn=turn: mount @ turn),  # type: ignore[misc]
-            price,
-            trial.turned(group, lambda _, rotation, turn=turn: rotation @ turn),  # type: ignore[misc]
-        )
-        yield Alternative(
-            "mount",
-            trial.named(group),
-            f"{whose} mounted {abs(signed)} deg to the {side} of where it is said to look",
-            remedies.mount(trial.cameras, group, lambda mount, turn=turn: turn @ mount),  # type: ignore[misc]
-            price,
-            trial.turned(
-                group,
-                lambda index, rotation, turn=turn: (  # type: ignore[misc]
-                    rotation @ trial.mount(index).T @ turn @ trial.mount(index)
-                ),
-            ),
-        )
-    down = {index: remedies.down_deg(trial.cameras[index]) for index in trial.moving}
+        rolled = f"{whose} is rolled by {signed} deg about the optical axis"
+        remedy = remedies.mount(cameras, group, after=turn)
+        yield Posed("mount", rolled, remedy, rotation @ turn, None, group, price)
+        side = "left" if degrees <= 180 else "right"
+        aside = f"{whose} is mounted {abs(signed)} deg to the {side} of where it is said to look"
+        remedy = remedies.mount(cameras, group, before=turn)
+        yield Posed("mount", aside, remedy, rotation @ mounts.mT @ turn @ mounts, None, group, price)
+    down = {index: remedies.down_deg(cameras[index]) for index in trial.moving}
     tilted = {index: turn_about("x", 2 * degrees) for index, degrees in down.items() if abs(degrees) > 1}
     if tilted:
-        yield Alternative(
-            "mount",
-            trial.named(list(tilted)),
-            "the tilt of every camera has the wrong sign",
-            "; ".join(
-                remedies.mount(trial.cameras, [index], lambda mount, turn=turn: mount @ turn)  # type: ignore[misc]
-                for index, turn in tilted.items()
-            ),
-            0.5,
-            trial.turned(list(tilted), lambda index, rotation: rotation @ tilted[index]),
-        )
+        what = "the tilt of every camera has the wrong sign"
+        remedy = "; ".join(remedies.mount(cameras, [index], after=turn) for index, turn in tilted.items())
+        turns = np.array([tilted.get(index, np.eye(3)) for index in trial.every])[:, None]
+        yield Posed("mount", what, remedy, rotation @ turns, None, list(tilted))
 
 
 _MEANT = {
@@ -350,46 +349,36 @@ _MEANT = {
 }
 
 
-def _gimbals(trial: Trial) -> Iterator[Alternative]:
+def _gimbals(trial: Trial) -> Iterator[Posed]:
     """Try the other axes of gimbals' angles, and angles that are relative to something else."""
+    rotation, mounts = trial.described.rotation, trial.mounts
     of = {index: trial.cameras[index].entry.poses for index in trial.moving}
+
+    def row(group: list[int], what: str, line: str, turned: Float) -> Posed:
+        remedy = "; ".join(f"cameras.{trial.names[index]}.gimbal.{line}" for index in group)
+        return Posed("gimbal", f"the gimbals' angles are {what}", remedy, turned, None, group)
+
     group = [index for index, poses in of.items() if poses.gimbal == "world" and not poses.gimbal_fixed]
     if group:
         right = "enu" if of[group[0]].gimbal_axes == "ned" else "ned"
-
-        def other_axes(index: int, rotation: Float) -> Float:
-            mount = trial.mount(index)
-            return _ENU_FROM_NED @ rotation @ mount.T @ _FLU_FROM_FRD @ mount
-
-        what = f"the gimbals' angles are in {right.upper()}: tilts have the wrong sign"
-        yield _of_gimbals(trial, group, what, f"axes: {right}", other_axes)
-    carried = {
-        index: body
-        for index, poses in of.items()
-        if poses.gimbal in _MEANT and (body := _body(trial, index)) is not None
-    }
+        turned = _ENU_FROM_NED @ rotation @ mounts.mT @ _FLU_FROM_FRD @ mounts
+        yield row(group, f"in {right.upper()}: tilts have the wrong sign", f"axes: {right}", turned)
     for meant, said in _MEANT.items():
-
-        def relative(index: int, rotation: Float, meant: str = meant) -> Float:
-            frames, poses = _frames(carried[index]), of[index]
+        turned, group = rotation.copy(), []
+        for index, poses in of.items():
+            body = _body(trial, index)
+            if poses.gimbal not in _MEANT or poses.gimbal == meant or body is None:
+                continue
+            frames = _frames(body)
             if poses.gimbal_axes == "ned":
                 frames = {
                     name: frame @ (_ENU_FROM_NED if name == "world" else _FLU_FROM_FRD)
                     for name, frame in frames.items()
                 }
-            return frames[meant] @ np.swapaxes(frames[poses.gimbal or "world"], -1, -2) @ rotation
-
-        group = [index for index in carried if of[index].gimbal != meant]
+            turned[index] = frames[meant] @ frames[poses.gimbal].mT @ rotation[index]
+            group.append(index)
         if group:
-            what = f"the gimbals' angles are {said}"
-            yield _of_gimbals(trial, group, what, f"relative_to: {meant}", relative)
-
-
-def _of_gimbals(
-    trial: Trial, group: list[int], what: str, line: str, turn: Callable[[int, Float], Float]
-) -> Alternative:
-    remedy = "; ".join(f"cameras.{trial.names[index]}.gimbal.{line}" for index in group)
-    return Alternative("gimbal", trial.named(group), what, remedy, 0.5, trial.turned(group, turn))
+            yield row(group, said, f"relative_to: {meant}", turned)
 
 
 def _body(trial: Trial, index: int) -> Float | None:
@@ -414,13 +403,11 @@ def _frames(body: Float) -> dict[str, Float]:
     }
 
 
-def _conventions(trial: Trial) -> Iterator[Alternative]:
+def _conventions(trial: Trial) -> Iterator[Posed]:
     """Try other meanings of the logged poses: axes, inverses, orders of quaternions, units."""
-    scene, cameras = trial.described, trial.cameras
-    still = [index for index in trial.every if index not in trial.moving]
-    mounts = np.stack([trial.mount(index) for index in trial.every])[:, None]
+    scene, cameras, mounts = trial.described, trial.cameras, trial.mounts
     camera, place = scene.rotation, scene.position
-    body = camera @ np.swapaxes(mounts, -1, -2)
+    body = camera @ mounts.mT
     on_gimbal = {}
     for index in trial.moving:
         own = _body(trial, index)
@@ -434,13 +421,8 @@ def _conventions(trial: Trial) -> Iterator[Alternative]:
         for index, of in on_gimbal.items():
             if of is not None:
                 before, after = _frames(body[index])[of], _frames(bodies[index])[of]
-                turned[index] = after @ np.swapaxes(before, -1, -2) @ camera[index]
+                turned[index] = after @ before.mT @ camera[index]
         return turned
-
-    def moved(rotation: Float, position: Float) -> SceneOfMoments:
-        rotation, position = rotation.copy(), position.copy()
-        rotation[still], position[still] = scene.rotation[still], scene.position[still]
-        return replace(scene, rotation=rotation, position=position)
 
     stated = cameras[trial.moving[0]].entry.poses
     # The exchange of axes is its own inverse.
@@ -449,14 +431,14 @@ def _conventions(trial: Trial) -> Iterator[Alternative]:
     of_camera, of_body = (
         f"world_from_{of}" if stated.inverse else f"{of}_from_world" for of in ("camera", "body")
     )
-    exchanged = remedies.pose(cameras, lambda _: f"axes: {axes}")
+    exchanged = remedies.pose(cameras, f"axes: {axes}")
     upside_down = remedies.pose(cameras, remedies.upside_down)
     inverted = remedies.pose(cameras, remedies.inverse)
-    its_own = remedies.pose(cameras, lambda _: remedies.OF_CAMERA)
-    the_body = remedies.pose(cameras, lambda _: remedies.OF_BODY)
+    its_own = remedies.pose(cameras, remedies.OF_CAMERA)
+    the_body = remedies.pose(cameras, remedies.OF_BODY)
     z = "up" if stated.z == "down" else "down"
     turned = carried_by(_ENU_FROM_NED @ body @ _FLU_FROM_FRD)
-    camera_back, body_back = np.swapaxes(camera, -1, -2), np.swapaxes(body, -1, -2)
+    camera_back, body_back = camera.mT, body.mT
     camera_origin, body_origin = (
         -np.einsum("ctij,ctj->cti", back, place) for back in (camera_back, body_back)
     )
@@ -479,36 +461,26 @@ def _conventions(trial: Trial) -> Iterator[Alternative]:
         table.append(("axes", f"{in_axes} the camera", exchanged, _ENU_FROM_NED @ camera, ned))
     if any(poses.mount for poses in held):
         # Of poses of the camera itself, it would be a roll by 180 deg.
-        remedy = remedies.mount(cameras, trial.moving, lambda mount: _FLU_FROM_FRD @ mount)
+        remedy = remedies.mount(cameras, trial.moving, before=_FLU_FROM_FRD)
         what = "the body's axes are FRD (forward, right, down)"
         table.append(("axes", what, remedy, body @ _FLU_FROM_FRD @ mounts, place))
     for attitudes, of_cameras in ((camera, np.asarray), (body, carried_by)):
         quaternion = quaternion_from_matrix(np.where(np.isfinite(attitudes), attitudes, np.eye(3)))
         for roll, order in ((-1, "wxyz"), (1, "xyzw")):
             turned = matrix_from_quaternion(np.roll(quaternion, roll, axis=-1))
-            remedy = remedies.pose(cameras, lambda _, order=order: f"quaternion: {order}")  # type: ignore[misc]
+            remedy = remedies.pose(cameras, f"quaternion: {order}")
             what = f"the quaternions are written as {' '.join(order)}"
             table.append(("convention", what, remedy, of_cameras(turned), place))
     for code, what, remedy, rotation, position in table:
-        instead = remedy or f"write the log again, since {what}"
-        yield Alternative(code, trial.names, what, instead, 0.5, moved(rotation, position))
+        yield Posed(code, what, remedy or f"write the log again, since {what}", rotation, position)
     # Lever arms are stated in metres, whatever the log's unit.
-    levers = np.array([each.lever_m for each in cameras])
-    arms = np.einsum("ctij,cj->cti", body, levers)
-    for unit, metres in _UNITS_M.items():
-        for factor, known, name in (
-            (metres, "", unit),
-            (1 / metres, f", and {1 / metres:.4g} times what is read", "m"),
-        ):
-            yield Alternative(
-                "unit",
-                trial.names,
-                f"the positions are in {name}{known}",
-                remedies.pose(cameras, lambda _, name=name: f"unit: {name}"),  # type: ignore[misc]
-                0.5,
-                moved(camera, (place - arms) * factor + arms),
-                same_scatter=True,
-            )
+    arms = np.einsum("ctij,cj->cti", body, np.array([each.lever_m for each in cameras]))
+    for name, metres in _UNITS_M.items():
+        what, again = f"the positions are in {name}", f", and {1 / metres:.4g} times what is read"
+        for unit, factor, known in ((name, metres, ""), ("m", 1 / metres, again)):
+            said = what.replace(name, unit) + known
+            remedy = remedies.pose(cameras, f"unit: {unit}")
+            yield Posed("unit", said, remedy, camera, (place - arms) * factor + arms, same_scatter=True)
 
 
 def _keypoints(trial: Trial) -> Iterator[Alternative]:
@@ -523,36 +495,34 @@ def _keypoints(trial: Trial) -> Iterator[Alternative]:
     for group, price in trial.groups(trial.every):
         one = len(group) < len(trial.names)
         whose = f" of {trial.names[group[0]]}" if one else ""
-        for factor in _SIZE_FACTORS:
-            yield Alternative(
+        rows: list[tuple[str, str, str, float, Callable[[Float, Filmed], Float]]] = [
+            (
                 "keypoints_size",
-                trial.named(group),
                 f"the keypoints{whose} are of pictures {1 / factor:.3g} times as large",
                 remedies.keypoints_size(trial.cameras, group, 1 / factor),
-                price,
-                trial.with_pixels(group, lambda pixels, _, factor=factor: pixels * factor),  # type: ignore[misc]
-            )
-        changes: dict[str, tuple[str, float, Callable[[Float, Filmed], Float]]] = {
-            "true": (
-                f"the pictures{whose} were mirrored before the keypoints were found",
                 0.0,
-                lambda pixels, own: x(pixels, own)[:, _LEFT_RIGHT],
-            ),
-            "x": (f"the keypoints{whose} count x from the right", 0.0, x),
-        }
-        if not one:  # a detector names and counts alike in all pictures
-            names = f"left and right are exchanged in the names of joints{whose}"
-            changes["y"] = (f"the keypoints{whose} count y from below", 0.0, y)
-            changes["names"] = (names, 0.3, lambda pixels, _: pixels[:, _LEFT_RIGHT])
-        for value, (what, dearer, change) in changes.items():
-            yield Alternative(
-                "mirrored",
-                trial.named(group),
-                what,
-                remedies.mirrored(trial.cameras, group, value),
-                price + dearer,
-                trial.with_pixels(group, change),
+                partial(_enlarged, factor=factor),
             )
+            for factor in _SIZE_FACTORS
+        ]
+        of_pictures = f"the pictures{whose} were mirrored before the keypoints were found"
+        flips = [
+            ("true", of_pictures, 0.0, lambda pixels, own: x(pixels, own)[:, _LEFT_RIGHT]),
+            ("x", f"the keypoints{whose} count x from the right", 0.0, x),
+        ]
+        if not one:  # a detector names and counts alike in all pictures
+            names = "left and right are exchanged in the names of joints"
+            flips.append(("y", "the keypoints count y from below", 0.0, y))
+            flips.append(("names", names, 0.3, lambda pixels, _: pixels[:, _LEFT_RIGHT]))
+        for value, what, dearer, change in flips:
+            rows.append(("mirrored", what, remedies.mirrored(trial.cameras, group, value), dearer, change))
+        for code, what, remedy, dearer, change in rows:
+            scene = trial.with_pixels(group, change)
+            yield Alternative(code, trial.named(group), what, remedy, price + dearer, scene)
+
+
+def _enlarged(pixels: Float, _: Filmed, factor: float) -> Float:
+    return pixels * factor
 
 
 # --- alternatives with numbers, which are fitted ---------------------------------------------------------
@@ -566,10 +536,6 @@ focal length is another; the number is then the logarithm of the factor.
 """
 
 _OF_ALL = ("focal", "pitch", "heading")
-# A turn of about this size, or a factor of about its exponential, is expected before the pictures are seen.
-_EXPECTED_RAD, _EXPECTED_ZOOM = 1.0, 0.5
-# The zero of a log lies about this far from the world's, before the pictures are seen.
-_EXPECTED_M = 30.0
 # A fit finds the best angle from within some 10 deg; those that are not here are tried all around.
 _STARTS_DEG = {"pitch": range(-90, 91, 15), "focal": (0,), "shift": (0,)}
 
@@ -598,10 +564,14 @@ def zoom(logarithm: float) -> float:
     return float(np.exp(np.clip(logarithm, -_MOST_ZOOM, _MOST_ZOOM)))
 
 
-def _expected(kind: str) -> list[float]:
-    """Return the standard deviations of numbers before the pictures are seen."""
-    angle = [_EXPECTED_ZOOM if kind == "focal" else _EXPECTED_RAD]
-    return [_EXPECTED_M] * (3 * (NUMBERS[kind] >= 3)) + angle * (NUMBERS[kind] in (1, 4))
+def sizes(numbers: Float) -> Float:
+    """Return the sizes [n] of fitted numbers: of shifts, in threes, and of an angle or logarithm at the end.
+
+    How large a mistake is, nobody knows before: all magnitudes are alike likely.
+    """
+    of_shifts = len(numbers) // 3 * 3
+    lengths = np.linalg.norm(numbers[:of_shifts].reshape(-1, 3), axis=1)
+    return np.concatenate([np.repeat(lengths, 3), np.abs(numbers[of_shifts:])])
 
 
 def numbers_of_all(trial: Trial) -> Iterator[Numbers]:
@@ -642,7 +612,6 @@ def _numbers(trial: Trial, kind: str, group: list[int]) -> Numbers:
     return Numbers(
         lambda numbers: changed(trial.described, kind, group, numbers),
         starts,
-        _expected(kind),
         lambda numbers, covariance: _of_numbers(trial, kind, group, numbers, covariance),
     )
 
@@ -675,10 +644,10 @@ def _of_numbers(
         code, remedy = "origin", remedies.origin(cameras, group[0], shift, np.radians(degrees))
     elif kind == "heading":
         turn = turn_about("z", degrees)
-        code, remedy = "pose", remedies.mount(cameras, group, lambda mount: turn @ mount)
+        code, remedy = "pose", remedies.mount(cameras, group, before=turn)
     else:
         turn = turn_about("x" if kind == "pitch" else "z", degrees)
-        code, remedy = "mount", remedies.mount(cameras, group, lambda mount: mount @ turn)
+        code, remedy = "mount", remedies.mount(cameras, group, after=turn)
     variance = np.diag(covariance)
     evidence = {}
     if NUMBERS[kind] >= 3:
@@ -722,7 +691,7 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
             "origin", cameras, what, remedy, PRICE_OF_ALL, same_scatter=True, evidence=evidence
         )
 
-    return Numbers(make, np.concatenate(start)[None], [_EXPECTED_M] * (3 * len(moved)), said)
+    return Numbers(make, np.concatenate(start)[None], said)
 
 
 # --- errors that are larger than stated ------------------------------------------------------------------

@@ -83,6 +83,10 @@ _HOVERING_M = 0.5
 _BELOW_M = 1.0
 # Alternatives that lower the objective by this much less than the best are stated beside it.
 _ALIKE = 1.0
+# Numbers that nothing shows stay within this, in m, rad or logarithms.
+_LOOSE = 30.0
+# Numbers may be of five magnitudes, each e times the other: twice the logarithm of that is paid for it.
+_OF_ANY_SIZE = 3.2
 # So many alternatives of the best scores are fitted to the rays.
 _FITTED = 12
 # Alternatives whose scores are farther from the best need no exact score.
@@ -261,7 +265,9 @@ class Compared(NamedTuple):
             least = MARGIN if alternative.alike else -_ALIKE
         else:
             least = -np.inf if odd else MARGIN
-        return self.gain >= MARGIN and self.rays_before - self.rays_after >= least
+        # Whoever is far too tall or small is doubted anyway.
+        margin = 0.0 if alternative.code == "scale" else MARGIN
+        return self.gain >= margin and self.rays_before - self.rays_after >= least
 
 
 class Objective:
@@ -310,7 +316,8 @@ class Objective:
         """Fit numbers, from where the rays miss each other least; None if they are too small to matter.
 
         Numbers cost as chi^2, beside their fit, the logarithm of how much surer the rays make them (the Occam
-        factor; MacKay 2003, chapter 28). So one that stated errors leave open costs little, and gains little.
+        factor; MacKay 2003, chapter 28), with a prior of their own size. So one that stated errors leave open
+        costs little, and gains little.
         """
 
         def misfit(numbers: Float) -> float:
@@ -319,13 +326,13 @@ class Objective:
             return float(np.median(chi2)) if chi2.size else np.inf
 
         start = min(free.starts, key=misfit) if len(free.starts) > 1 else free.starts[0]
-        found = fit(self.trial.flight, free.make, start, free.expected)
+        found = fit(self.trial.flight, free.make, start, [_LOOSE] * len(start))
         alternative = free.said(found.numbers, found.covariance)
         if alternative is None or not np.isfinite(found.cost):
             return None
-        sign, volume = np.linalg.slogdet(found.covariance)
-        surer = max(0.0, 2 * float(np.log(free.expected).sum()) - float(volume)) if sign > 0 else np.inf
-        return self.scored(replace(alternative, scene=found.scene), found.cost + surer)
+        size, normal = alternatives.sizes(found.numbers), np.linalg.pinv(found.covariance)
+        surer = float(np.linalg.slogdet(np.eye(len(size)) + size[:, None] * normal * size)[1])
+        return self.scored(replace(alternative, scene=found.scene), found.cost + surer + _OF_ANY_SIZE)
 
     def with_noise(self, tried: Sequence[Alternative]) -> Tried:
         """Take the factor of larger errors that fits best."""
@@ -362,6 +369,10 @@ class Objective:
             before = self._fit(same).cost
             total = min(total, score(self.trial.flight, same, self.base).total)
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene).cost
+        if tried.alternative.alike:
+            # Then each moment is of another picture, with other errors: sums of chi^2 differ by chance.
+            chance = before * float(np.sqrt(2 / self._pictures.sum()))
+            cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
         return Compared(*scores, self._rays(before, described), self._rays(cost, scene))
 
@@ -378,7 +389,11 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tri
 
     by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=without_rays)
     most = objective.base.total + surprise(unposed(objective.trial.described)) - LEAST_GAIN_OF_TIMES
-    by_score = [each for each in by_score[:_FITTED] if without_rays(each) <= most]
+    by_score = [
+        each
+        for each in by_score[:_FITTED]
+        if each.alternative.code not in TIMES or without_rays(each) <= most
+    ]
     weighed = []
     for each in [*by_score, *(each for each in tried if np.isfinite(each.cost))]:
         found = objective.compared(each)
@@ -535,7 +550,10 @@ _ODD = {
     "ground": ("ground", "the feet are {feet_above_ground_m:+.1f} m from the ground of the map"),
     "beside": ("ground", "the person is beside the map"),
     "level": ("ground", "the feet rise by {rise_m:.1f} m on a way of {walked_m:.1f} m"),
-    "unposed": ("clock", "pictures were taken when nothing logs a pose: {unposed_share:.0%} of one camera's"),
+    "unposed": (
+        "clock",
+        "pictures were taken when nothing logs a pose: {unposed_share:.0%} of each camera's",
+    ),
     "actor": ("actor", "the person is {from_actor_m:.1f} m from the logged actor"),
     "actor_path": ("actor", "the person takes another way than the logged actor, {path_apart_m:.1f} m apart"),
     "unused": ("residual", "{unused_share:.0%} of the joints cannot be used: their rays miss each other"),

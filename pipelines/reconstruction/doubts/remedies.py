@@ -5,46 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cache
 from io import StringIO
-from typing import Any, Protocol, get_args
+from typing import Any, get_args
 
 import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.util import load_yaml_guess_indent
 
-from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import Looks, body_from_camera
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
+from pipelines.reconstruction.doubts.scene import Filmed
 from pipelines.session.description import CameraEntry, PosesEntry
 
-
-class _Filming(Protocol):
-    """Interface of a camera for remedies; `scene.Filmed` has it."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def entry(self) -> CameraEntry: ...
-    @property
-    def intrinsics(self) -> Intrinsics: ...
-    @property
-    def t_ns(self) -> Int64: ...
-    @property
-    def static(self) -> bool: ...
-    @property
-    def mount(self) -> Float | None: ...
-    @property
-    def sigma(self) -> Sequence[float]: ...  # position m and rotation rad, then new and changing parts
-
-
+_EYE = np.eye(3)
 # Entries of equal rotation matrices differ by less than this.
 _SAME = 1e-3
 
 
-def _lines(cameras: Sequence[_Filming], group: Sequence[int], said: Callable[[_Filming], str]) -> str:
+def _lines(cameras: Sequence[Filmed], group: Sequence[int], said: Callable[[Filmed], str]) -> str:
     return "; ".join(f"cameras.{cameras[index].name}.{said(cameras[index])}" for index in group)
 
 
-def clock(cameras: Sequence[_Filming], group: Sequence[int], seconds: float) -> str:
+def clock(cameras: Sequence[Filmed], group: Sequence[int], seconds: float) -> str:
     """Move the clocks of cameras' pictures."""
     return _lines(cameras, group, lambda camera: offset_of(camera.entry, seconds))
 
@@ -54,12 +36,12 @@ def offset_of(entry: CameraEntry, seconds: float) -> str:
     return f"clock.offset_s: {entry.clock.offset_s + seconds:.3f}"
 
 
-def frame_rate(cameras: Sequence[_Filming], group: Sequence[int], factor: float) -> str:
+def frame_rate(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """State the frame rate of cameras, whose pictures follow each other `factor` times as slowly."""
     return _lines(cameras, group, lambda camera: f"frame_times.fps: {_rounded(rate_hz(camera) / factor)}")
 
 
-def rate_hz(camera: _Filming) -> float:
+def rate_hz(camera: Filmed) -> float:
     """Return the stated rate of all pictures, of which few may have been looked at."""
     return camera.entry.frames.rate_hz or 1e9 / float(np.median(np.diff(camera.t_ns)))
 
@@ -79,10 +61,10 @@ def earlier_or_later(seconds: float) -> str:
     return f"{abs(seconds):.3f} s {'later' if seconds > 0 else 'earlier'} than stated"
 
 
-def videos(cameras: Sequence[_Filming], order: Sequence[int]) -> str:
+def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:
     """Give cameras each other's pictures, or keypoints where those came with the flight."""
 
-    def said(camera: _Filming) -> str:
+    def said(camera: Filmed) -> str:
         if camera.entry.keypoints is not None:
             return f"keypoints.file: {camera.entry.keypoints.source}"
         media = camera.entry.media
@@ -95,23 +77,28 @@ def videos(cameras: Sequence[_Filming], order: Sequence[int]) -> str:
     )
 
 
-def mount(cameras: Sequence[_Filming], group: Sequence[int], turned: Callable[[Float], Float]) -> str:
-    """Turn body_from_camera [3, 3] of cameras; of a camera without a mount, state what turns its pose."""
+def mount(
+    cameras: Sequence[Filmed], group: Sequence[int], *, before: Float = _EYE, after: Float = _EYE
+) -> str:
+    """Turn body_from_camera [3, 3] of cameras in the body's or the camera's axes.
 
-    def said(camera: _Filming) -> str:
+    Of a camera without a mount, state what turns its pose.
+    """
+
+    def said(camera: Filmed) -> str:
         stored = camera.entry.poses.mount or camera.entry.poses.in_gimbal
         if stored is None:
             forwards = matrix_from_quaternion(body_from_camera("forward"))
-            rotation = quaternion_from_matrix(forwards.T @ turned(forwards))
+            rotation = quaternion_from_matrix(forwards.T @ before @ forwards @ after)
             return f"pose.of: body; cameras.{camera.name}.mount: {_rigid([0.0, 0.0, 0.0], rotation)}"
-        rotation = turned(matrix_from_quaternion(np.array(stored.rotation_xyzw)))
+        rotation = before @ matrix_from_quaternion(np.array(stored.rotation_xyzw)) @ after
         words = _as_words(rotation, stored.translation)
         return f"mount: {words or _rigid(stored.translation, quaternion_from_matrix(rotation))}"
 
     return _lines(cameras, group, said)
 
 
-def down_deg(camera: _Filming) -> float:
+def down_deg(camera: Filmed) -> float:
     """Return by how much a camera's mount tilts it down; 0 without a mount, or where that is no tilt."""
     mount = camera.mount
     if mount is None:
@@ -152,14 +139,14 @@ def _levels() -> dict[Looks, Float]:
     return {looks: matrix_from_quaternion(body_from_camera(looks)) for looks in get_args(Looks)}
 
 
-def turned_world(cameras: Sequence[_Filming], up: Float) -> str:
+def turned_world(cameras: Sequence[Filmed], up: Float) -> str:
     """Turn every source by the shortest rotation that brings a direction [3] upwards."""
     quaternion = np.append(np.cross(up, [0.0, 0.0, 1.0]), 1.0 + up[2])
     turn = matrix_from_quaternion(quaternion / np.linalg.norm(quaternion))
     return _lines(cameras, range(len(cameras)), lambda camera: _placed(camera, np.zeros(3), turn))
 
 
-def _placed(camera: _Filming, shift: Float, turn: Float) -> str:
+def _placed(camera: Filmed, shift: Float, turn: Float) -> str:
     """State where the world of a camera's log lies, turned [3, 3] and moved [3] m from what is stated."""
     stated = camera.entry.poses.world_from_source
     half_rad = np.radians(stated.yaw_deg) / 2
@@ -177,15 +164,20 @@ def _placed(camera: _Filming, shift: Float, turn: Float) -> str:
     return f"pose.world_from_source: {{{', '.join(parts or ['translation: [0, 0, 0]'])}}}"
 
 
-def unit(cameras: Sequence[_Filming], name: str) -> str:
+def unit(cameras: Sequence[Filmed], name: str) -> str:
     """State the unit of all cameras' positions."""
     return _lines(cameras, range(len(cameras)), lambda _: f"pose.unit: {name}")
 
 
-def pose(cameras: Sequence[_Filming], said: Callable[[PosesEntry], str]) -> str:
+def pose(cameras: Sequence[Filmed], said: str | Callable[[PosesEntry], str]) -> str:
     """State how the poses of the moving cameras are written, beside how they are read."""
     moving = [index for index in range(len(cameras)) if not cameras[index].static]
-    return _lines(cameras, moving, lambda camera: "pose." + said(camera.entry.poses).format(camera.name))
+
+    def line(camera: Filmed) -> str:
+        stated = said if isinstance(said, str) else said(camera.entry.poses)
+        return "pose." + stated.format(camera.name)
+
+    return _lines(cameras, moving, line)
 
 
 def inverse(poses: PosesEntry) -> str:
@@ -205,10 +197,10 @@ OF_CAMERA = "of: camera; cameras.{}.mount: null"
 """The poses are those of the cameras, without a mount."""
 
 
-def keypoints_size(cameras: Sequence[_Filming], group: Sequence[int], factor: float) -> str:
+def keypoints_size(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """State the size of the pictures that keypoints are of; of film, calibrate the lens for its pictures."""
 
-    def said(camera: _Filming) -> str:
+    def said(camera: Filmed) -> str:
         if camera.entry.keypoints is None:
             return _lens(camera, factor, factor)
         width, height = camera.intrinsics.width * factor, camera.intrinsics.height * factor
@@ -226,7 +218,7 @@ _MIRRORS = {
 }
 
 
-def mirrored(cameras: Sequence[_Filming], group: Sequence[int], value: str) -> str:
+def mirrored(cameras: Sequence[Filmed], group: Sequence[int], value: str) -> str:
     """State that keypoints are mirrored, besides what is stated of that: twice is not at all.
 
     No line does that for film, in which the keypoints are still to be found: it is turned over itself.
@@ -248,12 +240,12 @@ def mirrored(cameras: Sequence[_Filming], group: Sequence[int], value: str) -> s
     return "; ".join(lines)
 
 
-def intrinsics(cameras: Sequence[_Filming], group: Sequence[int], factor: float) -> str:
+def intrinsics(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """Multiply the focal lengths of cameras."""
     return _lines(cameras, group, lambda camera: _lens(camera, factor, 1.0))
 
 
-def _lens(camera: _Filming, focal: float, centre: float) -> str:
+def _lens(camera: Filmed, focal: float, centre: float) -> str:
     """State the intrinsics of a camera, with factors on the focal length and the principal point."""
     own = camera.intrinsics
     model = "" if own.model == "none" else f", model: {own.model}, distortion: {list(own.distortion)}"
@@ -263,10 +255,10 @@ def _lens(camera: _Filming, focal: float, centre: float) -> str:
     )
 
 
-def pose_noise(cameras: Sequence[_Filming], group: Sequence[int], factor: float) -> str:
+def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """State errors of poses that are larger by a factor: constant ones, and those that change."""
 
-    def said(camera: _Filming) -> str:
+    def said(camera: Filmed) -> str:
         sigma = factor * np.array(camera.sigma)
         position, rotation = np.sqrt(np.maximum(sigma[:2] ** 2 - sigma[4:] ** 2, 0.0))
         return (
@@ -277,13 +269,13 @@ def pose_noise(cameras: Sequence[_Filming], group: Sequence[int], factor: float)
     return _lines(cameras, [index for index in group if not cameras[index].static], said)
 
 
-def origin(cameras: Sequence[_Filming], index: int, shift: Float, yaw_rad: float = 0.0) -> str:
+def origin(cameras: Sequence[Filmed], index: int, shift: Float, yaw_rad: float = 0.0) -> str:
     """Place the world of a camera's log in the flight's, beside what is stated of that already."""
     turn = matrix_from_quaternion(np.array([0.0, 0.0, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)]))
     return _lines(cameras, [index], lambda camera: _placed(camera, shift, turn))
 
 
-def own_origins(cameras: Sequence[_Filming], shifts: Float) -> str:
+def own_origins(cameras: Sequence[Filmed], shifts: Float) -> str:
     """Place the worlds of all logs, which are moved by `shifts` [C, 3] m."""
     moved = [index for index in range(len(cameras)) if np.abs(shifts[index]).max() > 0]
     return "; ".join(origin(cameras, index, shifts[index]) for index in moved)

@@ -110,7 +110,7 @@ class SceneOfMoments:
     focal_px: Float  # [C]
     sigma: Float  # [C, 6] as `PoseSigma`
     person_px: Float  # [C] height of the person in the pictures, median
-    unposed: Float  # [C] share of a camera's pictures that were taken before or after its log
+    unposed: Float  # [C] share of a camera's pictures before or after its log; NaN of one that stands still
 
 
 class Sampled(NamedTuple):
@@ -335,10 +335,10 @@ def scene_of(
 
 
 def _outside(t_ns: Float, camera: Filmed, between: Interpolation) -> float:
-    """Return the share of times before or after a camera's log; 0 of one that stands still."""
+    """Return the share of times before or after a camera's log; NaN of one that stands still."""
     logged = camera.camera.trajectory.t_ns
     beyond = np.maximum(logged[0] - t_ns, t_ns - logged[-1]) > between.max_extrapolation_ns
-    return 0.0 if camera.static else float(beyond.mean())
+    return float("nan") if camera.static else float(beyond.mean())
 
 
 def _poses(flight: Sampled) -> tuple[Float, Float]:
@@ -405,7 +405,11 @@ _TREAD_NS = 500_000_000
 # In fewer moments, or of somebody slower, the standing foot tells nothing.
 _FEWEST_TREADS, _LEAST_TREAD_MPS = 8, 0.6
 # Ankles that stand roll forwards: legs go at this share of the pace.
-_USUAL_TREAD = 0.88
+_USUAL_TREAD = 0.92
+# Runners fly between their steps, and then no foot is left behind.
+_USUAL_TREAD_OF_RUNNERS = 0.72
+# People run from this squared pace over stature, m/s^2: a Froude number of 0.5 (Alexander 1989).
+_RUN = 2.6
 # Who rides or slides is rare, and counts at most so much.
 _MOST_TREAD = 3.0
 # People run no faster than this.
@@ -422,6 +426,8 @@ _HEAD_DOWN = -0.3
 _BENT_COSINE = np.cos(np.radians(30))
 # A joint that bends at a smaller cosine against forwards may bend to the side.
 _CLEARLY = 0.5
+# A nose that is nearer to the ears than this share of their distance is neither ahead nor behind.
+_AHEAD_OF_EARS = 0.25
 # An upper arm at a smaller cosine against downwards does not hang.
 _HANGING = 0.5
 
@@ -510,8 +516,10 @@ class Body:
             "bend": Oddity(max(0.0, 0.4 - bent) / 0.06, {"bent_forwards_share": bent}),
         }
         forwards = self._forwards
+        forwards = forwards / np.linalg.norm(forwards, axis=-1, keepdims=True)
         nose = ((self["nose"] - (self["left_ear"] + self["right_ear"]) / 2) * forwards).sum(axis=-1)
-        nose = nose[np.isfinite(nose)]
+        wide = np.linalg.norm(self["left_ear"] - self["right_ear"], axis=-1)
+        nose = nose[np.abs(nose) > _AHEAD_OF_EARS * wide]
         if len(nose) > _FEWEST_MOMENTS:
             ahead = float((nose > 0).mean())
             odd["face"] = Oddity(max(0.0, 0.6 - ahead) / 0.06, {"nose_in_front_share": ahead})
@@ -592,10 +600,10 @@ class Body:
             "speed": Oddity(max(0.0, fast - 4.0 - 1.5 * noise) / (2 + noise), {"pace_mps": fast}),
             "climb": Oddity(max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2), {"climb_mps": climbed}),
             "slide": Oddity(slides, {"foot_mps": slid}),
-            "tread": self._tread(flight, of_foot),
+            "tread": self._tread(flight, stature, of_foot),
         }
 
-    def _tread(self, flight: Sampled, noise_mps: float) -> Oddity:
+    def _tread(self, flight: Sampled, stature: float, noise_mps: float) -> Oddity:
         """Compare how fast the standing foot is left behind with how fast the person walks.
 
         It stands still, so both are alike in a world of any scale, but not with a wrong focal length, or at
@@ -619,7 +627,8 @@ class Body:
         walked = float(pace[known].mean())
         share = float(legs[known].mean()) / walked
         sigma = np.hypot(0.15, noise_mps / walked / np.sqrt(known.sum()))
-        off = abs(np.log(max(share, 0.01) / _USUAL_TREAD))
+        usual = _USUAL_TREAD_OF_RUNNERS if walked**2 > _RUN * stature else _USUAL_TREAD
+        off = abs(np.log(max(share, 0.01) / usual))
         return Oddity(min(max(0.0, off - 0.15) / sigma, _MOST_TREAD), {"legs_over_pace": share})
 
     def _ahead(self, flight: Sampled, white_m: float) -> float:

@@ -430,8 +430,8 @@ _ANKLE_ABOVE_GROUND_M = 0.08
 _UNUSED_SIGMAS = 4.0
 # Right flights have less than 0.01 of joints that cannot be used.
 _USUALLY_UNUSED = 0.2
-# Two in three right flights have a smaller share of pictures that outlast their log.
-_UNPOSED_SIGMA = 0.02
+# Two in three right flights have a camera with a smaller share of pictures that outlast its log.
+_UNPOSED_SIGMA = 0.015
 # A log that ends early is no mistake of the description, however early.
 _MOST_UNPOSED = 0.14
 # Ground that no map shows is no steeper than this.
@@ -440,7 +440,7 @@ _SLOPE = 0.3
 _HALF_BODY_M = 0.5
 # The scatter of rays counts this much beside what is odd about a person.
 SCATTER_WEIGHT = 12.0
-SCATTER_RANGE = (0.4, 30.0)  # what is less is no better: keypoints scatter by themselves
+SCATTER_RANGE = (0.4, 30.0)  # what is less is no better, where it is not worse in the same pixels
 
 
 class Score(NamedTuple):
@@ -458,6 +458,7 @@ class Base(NamedTuple):
 
     total: float
     scatter: float
+    person_px: Float  # [C] as of the scene
     covered: float  # share of joints and moments that two cameras see
 
 
@@ -490,12 +491,16 @@ def score(
     behind = Oddity(share_behind / 0.05, {"behind_share": share_behind})
     total = float(2 * np.log1p((misfit / soft) ** 2) + np.log1p(behind.sigmas**2))
     reference = None if base is None or same_scatter else base.scatter
-    gain = 0.0 if reference is None else SCATTER_WEIGHT * np.log(reference / SCATTER_RANGE[0])
+    gain = 0.0 if reference is None else SCATTER_WEIGHT * np.log(max(reference / SCATTER_RANGE[0], 1.0))
     if total - gain > limit:
         return Score(total, misfit, np.inf, {"behind": behind}, np.nan)
     scatter = _scatter(scene, solved)
-    if reference is not None:
-        total += SCATTER_WEIGHT * float(np.log(np.clip(scatter, *SCATTER_RANGE) / reference))
+    if base is not None and reference is not None:
+        floor, top = SCATTER_RANGE
+        # In the same pixels, keypoints scatter as much; a wrong focal length bends what little they do.
+        floor = min(floor, reference) if np.array_equal(scene.person_px, base.person_px) else floor
+        least = np.clip(reference, SCATTER_RANGE[0], top) if scatter < reference else max(reference, floor)
+        total += SCATTER_WEIGHT * float(np.log(np.clip(scatter, floor, top) / least))
         if total > limit:
             return Score(total, misfit, scatter, {"behind": behind}, np.nan)
     body = Body(solved.joints)
@@ -516,20 +521,20 @@ def surprise(odd: Oddity) -> float:
 
 
 def unposed(scene: SceneOfMoments) -> Oddity:
-    """Measure pictures before or after their camera's log: it is read beside the score, as rays are.
+    """Measure pictures before or after their cameras' logs: it is read beside the score, as rays are.
 
-    Whom the pictures show says nothing about it, so it tells other times of all cameras from chance.
+    Whom the pictures show says nothing about it, so it tells other times of all cameras from chance. One
+    log may end early.
     """
-    share = float(scene.unposed.max())
+    share = min((float(each) for each in scene.unposed if np.isfinite(each)), default=0.0)
     return Oddity(min(share, _MOST_UNPOSED) / _UNPOSED_SIGMA, {"unposed_share": share})
 
 
 def base_of(flight: Sampled, scene: SceneOfMoments) -> tuple[Base, Score]:
     """Score the scene as described; other scenes are scored against it."""
     described = score(flight, scene)
-    scatter = float(np.clip(described.scatter, *SCATTER_RANGE))
     covered = float((solve(scene).views >= 2).mean())
-    return Base(described.total, scatter, covered), described
+    return Base(described.total, described.scatter, scene.person_px, covered), described
 
 
 def _misfit(solved: SolvedJoints, good: Bool) -> float:
