@@ -12,8 +12,6 @@ straight, the knee's is drawn towards the line of the hips, so that noise does n
 flexion cannot be negative. Pronation of the forearm is never shown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -135,6 +133,13 @@ def _known(covariance: Float) -> Float:
     return np.where(np.abs(covariance) < _UNKNOWN_M2, covariance, np.nan)
 
 
+@dataclass(frozen=True)
+class _Group:
+    angles: tuple[str, ...]  # A of them
+    joints: tuple[str, ...]  # K of them
+    compute: Callable[[Float], Float]  # from points [K, 3, N] m to angles [A, N] rad
+
+
 def _sigma(group: _Group, points: Float, found: Float, covariance: Float) -> Float:
     """Propagate covariances [K, 6, N] of points [K, 3, N] to standard deviations [A, N] rad of angles."""
     variance = np.zeros_like(found)
@@ -151,13 +156,6 @@ def _sigma(group: _Group, points: Float, found: Float, covariance: Float) -> Flo
         xx, xy, xz, yy, yz, zz = covariance[joint]
         variance += x * (xx * x + 2 * xy * y + 2 * xz * z) + y * (yy * y + 2 * yz * z) + zz * z * z
     return np.sqrt(np.maximum(variance, 0.0))
-
-
-@dataclass(frozen=True)
-class _Group:
-    angles: tuple[str, ...]  # A of them
-    joints: tuple[str, ...]  # K of them
-    compute: Callable[[Float], Float]  # from points [K, 3, N] m to angles [A, N] rad
 
 
 _TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")

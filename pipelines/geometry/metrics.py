@@ -5,8 +5,6 @@ of one person at one time, a person-frame one person at one time. Means run over
 shapes disagree, or stamps do not increase.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -225,17 +223,6 @@ def _mirrored(bones: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
 # --- shared steps --------------------------------------------------------------------------------------
 
 
-def _distances(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> _Distances:
-    _check_shapes(estimate, truth, joints, t_ns)
-    return _Distances(
-        has_truth=common(truth),
-        absolute=_length(estimate - truth),
-        root=root_relative_distances(estimate, truth, joints),
-        aligned=aligned_distances(estimate, truth),
-        acceleration=_length(_derivative(estimate - truth, t_ns, 2)),
-    )
-
-
 @dataclass(frozen=True)
 class _Distances:
     """Distances between estimate and truth in m (and m/s^2), [T, P, J], NaN where one is missing."""
@@ -278,6 +265,17 @@ class _Distances:
             "pck150_auc": (near, judged),
             "acceleration_error_mm_s2": _summed(acceleration),
         }
+
+
+def _distances(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> _Distances:
+    _check_shapes(estimate, truth, joints, t_ns)
+    return _Distances(
+        has_truth=common(truth),
+        absolute=_length(estimate - truth),
+        root=root_relative_distances(estimate, truth, joints),
+        aligned=aligned_distances(estimate, truth),
+        acceleration=_length(_derivative(estimate - truth, t_ns, 2)),
+    )
 
 
 def _summed(distance_m: Float) -> Series:

@@ -3,11 +3,9 @@
 Only ingest writes it. Every later stage reads it through this module and does not open the manifest again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -323,7 +321,7 @@ class Description(Entry):
     warnings: list[str]
 
     @model_validator(mode="after")
-    def _names_are_of_cameras(self) -> Description:
+    def _names_are_of_cameras(self) -> Self:
         """Refuse names that are unsafe as folders: those of a foreign session must not lead out of it."""
         refuse_camera_names(self.cameras)
         named = [self.clock_reference, *(self.plan or {}), *(self.truth.cameras if self.truth else [])]

@@ -4,8 +4,6 @@ Each is found through an entry point, which names an object that has the protoco
 extension needs an optional library that is missing, the error gives the command that installs it.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -14,7 +12,7 @@ from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points, requires
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,7 +147,7 @@ class Log(Protocol):
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some channels in the order of receipt; others are not decoded."""
 
-    def __enter__(self) -> Log:
+    def __enter__(self) -> Self:
         """Return the log itself."""
 
     def __exit__(self, *exception: object) -> None:

@@ -1,11 +1,9 @@
 """Models of users' YAML files: an unknown key is refused with the nearest known one."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from typing import Annotated, Any, ClassVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Self, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo, field_validator, model_validator
 from pydantic.fields import FieldInfo
@@ -54,7 +52,7 @@ class YamlModel(BaseModel):
         return value
 
     @model_validator(mode="after")
-    def _exactly_one(self) -> YamlModel:
+    def _exactly_one(self) -> Self:
         stated = [name for name in self.one_of if getattr(self, name) not in (None, "")]
         if self.one_of and len(stated) != 1:
             raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")

@@ -16,14 +16,12 @@ World axes as in the session, cameras with x right, y down, z forward. Poses are
 any. The same recording gives the same bytes; frames are never all in memory.
 """
 
-from __future__ import annotations
-
 import heapq
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -72,7 +70,7 @@ class Ros2Recording:
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
 
-    def __enter__(self) -> Ros2Recording:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
