@@ -419,7 +419,6 @@ def _counted(
     unseen: tuple[int, ...],
     reasons: tuple[str, ...],
 ) -> Association:
-    """Build the result: the choice with its counts."""
     present = (chosen >= 0).transpose(2, 0, 1)
     others_see = present.sum(-1, keepdims=True) > 1
     refused = ~present & others_see & (seen.track >= 0).any(-1)

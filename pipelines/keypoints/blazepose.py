@@ -326,7 +326,6 @@ def _region(centre: Float, top: Float) -> Region:
 
 
 def _shifted(region: Region, crop_px: float) -> Region:
-    """Move a region by that many crop pixels, to its right and down."""
     x, y = _axes(region) @ np.full(2, crop_px) + region.centre
     return Region((float(x), float(y)), region.side, region.angle_rad)
 

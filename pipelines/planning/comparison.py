@@ -199,7 +199,6 @@ def _errors(
 
 
 def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool | None) -> dict[str, Any]:
-    """Compute the view quality over all people, and of several people the figures of each."""
     flown, people = result.flight, scene.people
     covered = viewed(
         flown.position,
@@ -236,7 +235,6 @@ def _difference(
     names: tuple[str, str],
     shared: Bool | None,
 ) -> dict[str, Any]:
-    """Compute one arm minus the other, with intervals."""
     one, other = (results[name] for name in names)
     tilts, hidden = (
         [_tilt_deg(scene, each.flight).mean(axis=0) for each in (one, other)],
@@ -254,7 +252,6 @@ def _difference(
 def _error_difference(
     one: ArmResult, other: ArmResult, shared: Bool | None
 ) -> dict[str, MeanWithInterval | None]:
-    """Compute the errors of one arm minus those of the other, trials paired."""
     a, b, frames = one.error_m, other.error_m, (one.joint_frames, other.joint_frames)
     if a is None or b is None or shared is None:
         return dict.fromkeys(("mpjpe_mm", "coverage", "pck150"))
@@ -269,9 +266,6 @@ def _error_difference(
 def _tilt_deg(scene: ReplayScene, flown: ArmFlight) -> Float:
     tilt_deg: Float = np.degrees(slot_of(flown.position - aimed_at(scene, flown))[..., TILT])
     return tilt_deg
-
-
-# --- the verdict ---
 
 
 def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]:

@@ -279,7 +279,6 @@ def _reached(lattice: Lattice, start: Float, times: int) -> Bool:
 
 @helper
 def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
-    """Find the cheapest sequence; see `best_sequence`."""
     times, states = cost.shape
     value = cost.copy()
     following = np.zeros((times, states), np.int64)

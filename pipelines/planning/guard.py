@@ -206,7 +206,6 @@ class Guard:
         return states, stopped
 
     def _ways_out(self, here: Float, around: _Around) -> list[tuple[FlownMotion, Float]]:
-        """Return velocities for ways out."""
         place = here[POSITION]
         actor = around.people[np.linalg.norm(around.people[:, 0] - place, axis=-1).argmin()]
         up = np.array([0.0, 0.0, CLIMB_MPS])
@@ -311,7 +310,6 @@ def _least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> f
 
 @helper
 def _apart(a: Float, b: Float) -> float:
-    """Compute the distance of two points [3]."""
     dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 

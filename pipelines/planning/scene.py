@@ -208,7 +208,6 @@ def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
 def _skeleton(
     folder: Path, description: Description, reconstructed: StageRecord | None
 ) -> tuple[JointMotion | None, Source | None]:
-    """Return the true skeleton, or else the reconstructed one."""
     if description.truth is not None and description.has_true_joints:
         joints = tuple(description.truth.joints)
         return read_motion(folder / "truth.parquet", TRUTH, joints), "truth"
@@ -336,7 +335,6 @@ def _cameras(
 
 
 def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:
-    """Return the true poses of all cameras, if all of them are known."""
     moving = {name for name, entry in description.cameras.items() if not entry.poses.static}
     if description.truth is None or not moving or not moving <= set(description.truth.cameras):
         return {}

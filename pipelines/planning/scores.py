@@ -47,9 +47,6 @@ BODY_BELOW_HIPS_M = 0.95
 BODY_ABOVE_HIPS_M = 0.8
 
 
-# --- the ray model ---
-
-
 def ray_information(offset: Float, errors: ErrorModel) -> Float:
     """Compute one camera's expected information on a point: I = p (1 - d d')/s^2, none along the ray d.
 
@@ -97,9 +94,6 @@ def _minors(matrix: Float) -> tuple[Float, Float]:
     return np.stack([first, a * f - c * c, a * d - b * b], axis=-1), determinant
 
 
-# --- sight ---
-
-
 def hidden_by_people(camera: Float, target: Float, people: Float) -> Bool:
     """Test [...] if somebody's body, an upright cylinder, stands in a line of sight.
 
@@ -141,9 +135,6 @@ def in_view(camera: Float, looks_rad: Float, person: Float, fov_rad: float) -> B
     aside = wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - looks_rad)
     inside: Bool = np.abs(aside) <= fov_rad / 2.0
     return inside
-
-
-# --- figures of a flight ---
 
 
 def score(

@@ -281,7 +281,6 @@ def _continuous_deg(angle_rad: Float) -> Float:
 
 
 def _setting(metrics: Mapping[str, object]) -> str:
-    """Describe the flight and the reference of its scores."""
     drones, skeleton = number(metrics, "drones") or 0, text(metrics, "skeleton")
     trials = plural(number(metrics, "trials") or 0, "draw")
     filmed = {
@@ -310,7 +309,6 @@ _HIDDEN_COLUMN = Column("Hidden", "share of time")
 
 
 def _tables(metrics: Mapping[str, object]) -> list[Table]:
-    """Make the tables of the arms, of people, and of the differences between arms."""
     stated = section(metrics, "arms")
     groups = [section({"group": group}, "group") for group in items(metrics, "equal_ranges")]
     names = [str(name) for group in groups for name in items(group, "arms")]  # near ones first
@@ -518,7 +516,6 @@ def draw_from_above(replan: Replan) -> Figure:
 
 
 def _from_above(arm: ArmTrack, origin: Float) -> list[Mark]:
-    """Draw the paths of an arm, and its lines of sight at the keyframes."""
     rows, chosen, colour = slice(None, None, stride_for(len(arm.t_s))), keyframes(arm), CAMERAS[arm.colour]
     actor, places = arm.actor[:, :2] - origin, arm.position[..., :2] - origin
     marks: list[Mark] = [

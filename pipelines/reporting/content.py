@@ -123,9 +123,6 @@ def as_reconstructed(content: SessionContent) -> SessionContent:
     return replace(content, poses=content.poses | content.refined, frames=frames)
 
 
-# --- the skeleton as dense arrays ---
-
-
 @dataclass(frozen=True)
 class MeasuredMotion:
     """Joints over time: T stamps, P people, J joints, in the order in which the table first names them."""

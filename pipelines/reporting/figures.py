@@ -167,7 +167,6 @@ def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> Float:
 
 
 def _joints_and_bones(summary: Summary) -> Figure:
-    """Draw the status of every joint, and beside it the lengths of the bones."""
     joints, bars, left = summary.joints, [], np.zeros(len(summary.joints))
     for word in summary.statuses:
         share = np.array([100 * row.counts[word] / max(sum(row.counts.values()), 1) for row in joints])
@@ -244,7 +243,6 @@ def _status_shares(seconds: Float, motion: MeasuredMotion, bins: Float) -> Float
 
 
 def _residuals(summary: Summary, residuals: Mapping[str, tuple[Float, Float]]) -> Figure:
-    """Draw each camera's distance between keypoints and joints over time."""
     names = [camera.name for camera in summary.cameras]
     highest = [np.nanpercentile(px, 99) for _, px in residuals.values() if np.isfinite(px).any()]
     lines = []

@@ -36,9 +36,6 @@ def _template(name: str, **context: object) -> Markup:
     return Markup(environment().get_template(name).render(**context))  # noqa: S704 - escaped by the template
 
 
-# --- one session ---
-
-
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None, video: Video = "none") -> str:
     """Render the complete HTML of a session's report.
 
@@ -174,7 +171,6 @@ def _overlays(
 
 
 def _key_figures(summary: Summary) -> list[tuple[str, str, str]]:
-    """Return the numbers that say how good a recording is: value, unit and label."""
     if summary.share is None:
         frames = sum(camera.entry.frames.count for camera in summary.cameras)
         return [(wording.whole(frames), "", "frames")]
@@ -200,7 +196,6 @@ def _key_figures(summary: Summary) -> list[tuple[str, str, str]]:
 
 
 def _how_made(content: SessionContent, summary: Summary) -> list[Block]:
-    """List versions, settings and counts of each stage, and the hashes of the inputs."""
     blocks: list[Block] = [
         "The same inputs and settings give the same bytes. A key is the SHA-256 of all that decides a result."
     ]
@@ -220,9 +215,6 @@ def _how_made(content: SessionContent, summary: Summary) -> list[Block]:
         blocks.append(Table(f"made-{stage}", "", columns, kept, "settings"))
     columns = (Column("file", text=True), Column("SHA-256", text=True))
     return [*blocks, Table("inputs", "", columns, list(summary.description.sources.items()), "settings")]
-
-
-# --- many flights ---
 
 
 COLUMNS = (

@@ -198,7 +198,6 @@ def _series(values: Float) -> Series:
 
 
 def _values(summary: Summary) -> dict[str, Float]:
-    """Return every measure that has a value at all."""
     motion = summary.motion
     if motion is None:
         return {}
@@ -268,7 +267,6 @@ def _same_times(a: Int64, b: Int64) -> tuple[Int64, Int64]:
 
 
 def _shared_joints(first: Judged, other: Judged) -> tuple[list[int], list[int]]:
-    """Return the places of the joints that both have."""
     shared = [name for name in first.joints if name in other.joints]
     return [first.joints.index(name) for name in shared], [other.joints.index(name) for name in shared]
 

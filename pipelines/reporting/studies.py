@@ -137,9 +137,6 @@ def rows_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
-# --- tables --------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class StudyTable:
     """One table of a study."""
@@ -228,9 +225,6 @@ def _text(cell: Mapping[str, Any], name: str) -> str:
     return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-# --- the figure and the page ---------------------------------------------------------------------------
-
-
 def draw(folder: Path, metrics: Mapping[str, Any]) -> None:
     """Write the study's figure as `figure.svg`, `.png` and `.pdf`; equal studies give equal bytes."""
     write_drawing(folder, "figure", draw_study("study", metrics))
@@ -277,7 +271,6 @@ def draw_study(key: str, metrics: Mapping[str, Any]) -> Figure:
 
 
 def _draw_walk(key: str, metrics: Mapping[str, Any]) -> Figure:
-    """Draw a row of panels for each of two metrics, a panel for each method."""
     axis = metrics["axis"]
     at = list(dict.fromkeys(cell[axis] for cell in metrics["cells"]))
     places = [k if axis == "noise" else float(value) for k, value in enumerate(at)]
@@ -333,7 +326,6 @@ def _curve(
 
 
 def _draw_session(key: str, metrics: Mapping[str, Any]) -> Figure:
-    """Draw error against way for each combination."""
     cells = metrics["cells"]
     ranges, counts = (sorted({cell[name] for cell in cells}) for name in ("range_m", "robots"))
     others = [name for name in metrics["varied"] if name not in ("range_m", "robots")]

@@ -564,7 +564,6 @@ def doubts_of_flight(summary: Summary) -> list[dict[str, object]]:
 
 
 def _stated(doubt: Mapping[str, object]) -> str:
-    """State a doubt of the flight as `reconstruct` warns of it."""
     code, what, remedy = (text(doubt, key) for key in ("code", "what", "remedy"))
     return Doubt(code=code, cameras=[], what=what, evidence={}, remedy=remedy).as_warning()
 

@@ -138,7 +138,6 @@ def make_scene(
 def _notes(
     every: int, times: int, body: _PackedBody | None, around: RaisedSurface | None, strips: Sequence[Strip]
 ) -> list[str]:
-    """List differences from the tables, in whole sentences."""
     notes = []
     if every > 1:
         notes.append(
@@ -158,7 +157,6 @@ def _notes(
 
 
 def _packed_strip(strip: Strip, origin_ns: int, origin: Float) -> dict[str, object]:
-    """Return a camera's pictures as JSON."""
     moved = strip.projection.copy()
     moved[..., 3] += strip.projection[..., :3] @ origin
     return {
@@ -168,9 +166,6 @@ def _packed_strip(strip: Strip, origin_ns: int, origin: Float) -> dict[str, obje
         "joints": _packed(FULL_SCALE * strip.joints, np.int16),
         "projection": base64.b64encode(moved.astype("<f4").tobytes()).decode("ascii"),
     }
-
-
-# --- bodies ---
 
 
 @dataclass(frozen=True)
@@ -302,9 +297,6 @@ def _square_root(covariance: Float) -> Float | None:
     return root.reshape(covariance.shape) if np.isfinite(root).any() else None
 
 
-# --- cameras ---
-
-
 @dataclass(frozen=True)
 class _Placed:
     """A camera at the viewer's times: of the session, or of an arm of a comparison."""
@@ -350,9 +342,6 @@ def _picture_corners(camera: CameraRow) -> list[float]:
         (lens.height - 0.5 - lens.cy) / lens.fy,
     ]
     return _rounded(np.array(edges))
-
-
-# --- packing ---
 
 
 def _times_without_skeleton(summary: Summary) -> Int64:

@@ -256,13 +256,11 @@ def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
 
 
 def _bare(body: Undressed) -> Patch:
-    """Return skin and eyes."""
     quads = body.quads[body.part[body.quads].min(axis=1) != PARTS.index("cloth")]
     return _with_values(body, triangles(quads))
 
 
 def _suit(body: Undressed) -> Patch:
-    """Return the tights that clothes are cut from."""
     quads = body.quads[body.part[body.quads].min(axis=1) == PARTS.index("cloth")]
     return _with_values(body, triangles(quads))
 
@@ -336,7 +334,6 @@ def _put_on(patch: Patch, colour: Colour, off_m: Float) -> Patch:
 
 
 def _skin_and_hair(skin: Patch, outfit: Outfit, hair_m: float) -> tuple[Patch, Patch]:
-    """Return the skin that an outfit bares, with a little under every hem, and the hair on the scalp."""
     arm, leg = skin.values["arm"], skin.values["leg"]
     bare = (arm > outfit.sleeve - _TUCKED) | ((leg > outfit.leg - _TUCKED) & (leg < _SOCK_TOP + _TUCKED))
     bare |= (skin.values["below_collar"] < 0.04) & (arm <= 0)
@@ -364,7 +361,6 @@ def _skin_colours(outfit: Outfit) -> Float:
 
 
 def _shoes(patch: Patch, outfit: Outfit, unit: float) -> list[Patch]:
-    """Return shoes with level soles below the bare feet, and the socks above them."""
     place, normal, leg = (patch.values[name] for name in ("place", "normal", "leg"))
     off_m = np.where(leg > _SHOE_TOP, 0.007, 0.006) * unit
     sole = (place[:, 2] < 0.014 * unit) | ((normal[:, 2] < -0.45) & (place[:, 2] < 0.03 * unit))
@@ -502,7 +498,6 @@ def _standing(skinning: Skinning, skin: Skin) -> Float:
 
 
 def _measured(skinning: Skinning, skin: Skin, dressed: Dressed, strip_m: float) -> Rig:
-    """Measure the rig of a mesh."""
     points = _standing(skinning, skin)
     offset = skinning.offset.copy()
     ankle = sum(offset[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))

@@ -52,9 +52,6 @@ MEDIAN_PER_SIGMA = float(np.sqrt(2 * np.log(2)))
 _LIMBS = (("elbow", "wrist", "pinky", "index", "thumb"), ("knee", "ankle", "heel", "big_toe", "small_toe"))
 
 
-# --- the table -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ErrorTable:
     """Measured errors by joint (`ANY_JOINT` for all others) and tilt."""
@@ -87,9 +84,6 @@ def read_errors(path: Path) -> ErrorTable:
     for tilt, joint, *numbers in list(csv.reader(line for line in lines if not line.startswith("#")))[1:]:
         by_joint.setdefault(joint, []).append([float(number) for number in (tilt, *numbers)])
     return ErrorTable({joint: np.array(sorted(values)) for joint, values in by_joint.items()})
-
-
-# --- the detector --------------------------------------------------------------------------------------
 
 
 def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:

@@ -283,7 +283,6 @@ def _usable(lens: Intrinsics) -> Intrinsics:
 
 
 def _span_s(scenario: Scenario) -> tuple[float, float]:
-    """Return the first and last second of the logs."""
     return -LEAD_S, scenario.duration_s + LEAD_S
 
 
@@ -293,7 +292,6 @@ def _of_others(person: int) -> list[int]:
 
 
 def _motion_seed(seed: int, person: int) -> int:
-    """Seed of a person's way of moving."""
     if not person:
         return seed
     return int(np.random.default_rng([seed, _MOTION, person]).integers(2**32))

@@ -281,7 +281,6 @@ def _substeps(t_s: Float, k: int) -> tuple[int, float]:
 
 
 def _length(vectors: Float) -> Float:
-    """Compute the lengths [N, 1] of vectors [N, 3]."""
     x, y, z = vectors.T
     return np.asarray(np.sqrt(x**2 + y**2 + z**2)[:, None])
 

@@ -573,6 +573,5 @@ def _person_map(person: Mesh, axes: Float) -> ShadowMap:
 
 
 def _noise_key(seed: int, frame: int, position: Float) -> int:
-    """Compute the key of a picture's noise."""
     where = np.ascontiguousarray(position).view(np.uint32).tolist()
     return int(np.random.SeedSequence([seed, frame, *where]).generate_state(1, np.uint64)[0])

@@ -187,9 +187,6 @@ def retarget(
     return _on_ground(rig, moved(t_s, again=repeat), floor_m, ground)
 
 
-# --- the source's rest pose ----------------------------------------------------------------------------
-
-
 def _without_first_pose(source: SkeletalMotion) -> SkeletalMotion:
     if len(source.t_s) < 3:
         return source
@@ -257,9 +254,6 @@ def _laid_on(rig: Rig, rest: Float, match: dict[str, int]) -> Float:
     return laid
 
 
-# --- over time -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Pose:
     root: Float  # [T, 3] m, of the source
@@ -320,9 +314,6 @@ def _rounds(
 def _heading(rotation: Float) -> float:
     ahead = rotate(rotation, np.array([1.0, 0.0, 0.0]))
     return float(np.arctan2(ahead[1], ahead[0]))
-
-
-# --- on the ground -------------------------------------------------------------------------------------
 
 
 def _floor(rig: Rig, motion: BodyMotion) -> float:

@@ -37,9 +37,6 @@ Metres = Annotated[float, Field(gt=0, le=1000)]
 _SHOT = ("exposure_ms", "distortion", "readout_ms", "bitrate_mbps")
 
 
-# --- the actor -----------------------------------------------------------------------------------------
-
-
 class Body(YamlModel):
     """Appearance of the actor."""
 
@@ -156,9 +153,6 @@ ActorName = Annotated[str, AfterValidator(_is_topic)]
 """Part of a ROS 2 topic."""
 
 
-# --- the world -----------------------------------------------------------------------------------------
-
-
 class GroundSquare(YamlModel):
     """The visible and mapped ground: a square about its centre."""
 
@@ -238,9 +232,6 @@ class WorldSettings(YamlModel):
         if self.sun[2] <= 0.1:
             raise ValueError("sun: it must stand above the horizon: z above 0.1")
         return self
-
-
-# --- the drones ----------------------------------------------------------------------------------------
 
 
 class FormationSettings(YamlModel):

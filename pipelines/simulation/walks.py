@@ -295,7 +295,6 @@ def errors_in_common(
 
 
 def _reprojection_px(views: Views, points: Float) -> dict[str, float] | None:
-    """Compute the error between used keypoints and the skeleton, by the poses of the views."""
     off_px = reprojection_px(views, points.reshape(-1, 3))
     used = off_px[np.isfinite(off_px)]
     return {"mean": float(used.mean()), "median": float(np.median(used))} if used.size else None

@@ -226,7 +226,6 @@ def _has_room(
 
 
 def _away_from(wall: scenario.Wall, x: float, y: float) -> float:
-    """Compute the distance from a place to a wall's line."""
     (ax, ay), (bx, by) = wall.start, wall.end
     square = (bx - ax) ** 2 + (by - ay) ** 2
     share = min(max(((x - ax) * (bx - ax) + (y - ay) * (by - ay)) / square, 0), 1) if square else 0.0
@@ -345,7 +344,6 @@ def wall_surfaces(obstacles: Obstacles, seed: int) -> list[TriangleSurface]:
 
 
 def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> TriangleSurface:
-    """Draw a prism of the trunk's cross-section, its bark mottled."""
     x, y, low, high, radius = trunk
     bearing = np.arange(_SIDES) * (2 * np.pi / _SIDES)
     # The polygon has the circle's area: sides (1/2) R^2 sin(2 pi / sides) = pi r^2.
@@ -386,7 +384,6 @@ def _drawn_crown(crown: Float, sphere: tuple[Float, Int32], rng: np.random.Gener
 
 
 def _drawn_wall(slab: Float, rng: np.random.Generator) -> TriangleSurface:
-    """Draw four sides and the top, of stones that differ in tone."""
     x, y, cos, sin, length, thickness, low, high = slab
     along, across = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0])
     up = np.array([0.0, 0.0, 1.0])
