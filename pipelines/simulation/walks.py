@@ -111,24 +111,20 @@ def walk(seconds: float, rate_hz: float, seed: int) -> Walk:
             seed=seed,
         )
 
-    t_ns = _times_ns(seconds, rate_hz)
-    t_s = t_ns / 1e9
-    motion = at(t_s)
-    return Walk(t_ns, person, look.height_m, motion, person.keypoints(motion), _smoothed(at, t_s))
+    return _filmed(person, look.height_m, at, _times_ns(seconds, rate_hz))
 
 
 def walk_of(performer: Performer, scenario: Scenario, seconds: float, rate_hz: float) -> Walk:
     """Return the way of a scenario's person, whom cameras without obstacles film with the scenario's lens."""
     t_ns = _times_ns(min(seconds, scenario.duration_s), rate_hz)
-    person, t_s = performer.person, t_ns / 1e9
-    motion = performer.moving(t_s)
-    height_m, joints, aim = (
-        performer.look.body.height_m,
-        person.keypoints(motion),
-        _smoothed(performer.moving, t_s),
-    )
+    way = _filmed(performer.person, performer.look.body.height_m, performer.moving, t_ns)
     lens = replace(scenario.drones.camera.intrinsics(), readout_s=0.0)
-    return Walk(t_ns, person, height_m, motion, joints, aim, lens, scenario.keypoints)
+    return replace(way, lens=lens, errors=scenario.keypoints)
+
+
+def _filmed(person: PosablePerson, height_m: float, at: Callable[[Float], BodyMotion], t_ns: Int64) -> Walk:
+    motion = at(t_ns / 1e9)
+    return Walk(t_ns, person, height_m, motion, person.keypoints(motion), _smoothed(at, t_ns / 1e9))
 
 
 def _times_ns(seconds: float, rate_hz: float) -> Int64:
