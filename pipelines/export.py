@@ -1,15 +1,15 @@
 """Stage `export`: a session's skeleton and cameras in the formats of other programs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 
 from pipelines.formats.common.exporting import thinned
 from pipelines.geometry.arrays import Int64, Picture
@@ -55,10 +55,6 @@ from pipelines.session.tables import (
 )
 from pipelines.session.urls import is_there
 from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import pyarrow as pa
 
 PICTURES_HZ = 2.0
 """Default number of pictures of a camera in a recording per second."""

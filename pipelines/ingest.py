@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import pandas as pd
 
 from pipelines.drafting.found import GIMBAL, is_called
 from pipelines.formats.common.files import leads_out
@@ -414,8 +415,6 @@ class _FlightReader:
         missing, dropped = self._note_truth_missing(motion) if motion else (0, {})
         poses_dropped = {}
         if truth.poses:
-            import pandas as pd
-
             tables = []
             for name, stated in truth.poses.items():
                 poses = self.poses.true_poses(stated)
@@ -529,8 +528,6 @@ class _FlightReader:
         plan = self._flight.plan
         if not plan:
             return None
-        import pandas as pd
-
         tables, found = [], {}
         for name in (camera for camera in self._flight.cameras if camera in plan):
             stated = plan[name].file

@@ -11,9 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 
 from pipelines.detect import cameras_to_follow, detect, follow, hints_from, hints_of
 from pipelines.geometry.arrays import Bool, Float, Int64
@@ -132,9 +133,6 @@ from pipelines.session.tables import (
     join_tables,
     write_table,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 RECONSTRUCT = Stage("reconstruct", revision=30)
 # A longer gap is no measurement.

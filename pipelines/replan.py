@@ -5,17 +5,16 @@ alike; metrics.json marks what was simulated. The stage's folder holds the last 
 its name in a folder of its own.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from pipelines.formats.common.files import read_yaml
 from pipelines.geometry.arrays import Float
@@ -59,9 +58,6 @@ from pipelines.simulation.detector_errors import (
     view_of,
 )
 from pipelines.simulation.scenario import DetectorErrors
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 REPLAN_STAGE = Stage("replan", revision=8)
 
@@ -333,8 +329,6 @@ def read_result(folder: Path) -> ArmResult:
 
 
 def _actor_table(scene: ReplayScene) -> pd.DataFrame:
-    import pandas as pd
-
     table = pd.DataFrame({"t_ns": scene.t_ns, "person": 0})
     table[["x", "y", "z"]] = scene.actor
     return table

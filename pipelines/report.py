@@ -1,16 +1,15 @@
 """Stage `report`: one self-contained page about a session, and one that compares several sessions."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
@@ -66,10 +65,6 @@ from pipelines.session.tables import (
 )
 from pipelines.session.urls import is_there
 from pipelines.sources.pictures import CameraPictures, open_pictures, refuse_changed_pictures
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import pyarrow as pa
 
 REPORT = Stage("report", revision=18)
 # Figures of another revision are drawn again.

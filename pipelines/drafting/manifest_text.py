@@ -4,8 +4,6 @@ Keys, their order and the words on missing ones are those of the manifest's mode
 character: a value is always read back as the same, and a comment always ends at the end of its line.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from pipelines.formats.common.exporting import file_names_of_people, safe_file_name, tracks_of
 from pipelines.formats.common.files import TextFormat
@@ -241,8 +242,6 @@ TUM = TrajectoryFile("tum", "TUM trajectory", (".tum", ".txt", ".csv", ".log"), 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write poses so that reading them gives the same stamps and bit-identical numbers."""
-    import pandas as pd
-
     columns: dict[str, object] = {"t": format_seconds(trajectory.t_ns)}
     columns |= dict(zip(POSITION, trajectory.position.T, strict=True))
     columns |= dict(zip(QUATERNION, trajectory.quaternion_xyzw.T, strict=True))
@@ -344,8 +343,6 @@ def _covariance(table: TextTable) -> Float:
 
 def write_pose_csv(path: Path, trajectory: Trajectory) -> None:
     """Write `t_ns,x,y,z,qx,qy,qz,qw` and any covariance, so that reading gives the same numbers."""
-    import pandas as pd
-
     columns: dict[str, object] = {"t_ns": trajectory.t_ns}
     columns |= dict(zip(POSITION, trajectory.position.T, strict=True))
     columns |= dict(zip(QUATERNION, trajectory.quaternion_xyzw.T, strict=True))

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Int64, Intrinsics
 from pipelines.geometry.cameras import project, undistort
@@ -28,10 +29,6 @@ from pipelines.planning.guard import FlownMotion, Guard
 from pipelines.planning.local import DronePlan, LocalPlanner, tracking_times
 from pipelines.planning.scene import ReplayScene, planned_positions
 from pipelines.planning.scores import errors_of_views, hidden_by_people, sights
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 # Times are sums of periods: what is due this much early is due.
 DUE_ROUNDING_S = 1e-6
@@ -426,8 +423,6 @@ def measure_arm(scene: ReplayScene, flown: ArmFlight, detect: Detect) -> Measure
 
 def trajectories(scene: ReplayScene, flown: ArmFlight) -> pd.DataFrame:
     """Return the rows of `tables.REPLAN`."""
-    import pandas as pd
-
     count, times = flown.position.shape[:2]
     position, slots = _rows(flown.position), _rows(flown.slots)
     seen = seen_people(scene, flown)

@@ -5,24 +5,20 @@ not return to their start are dropped. Everything is followed, people too, so th
 pictures alone; sightings on people are dropped when tracks are loaded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bytes, Float, Int64
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.errors import DataError
 from pipelines.session.tables import TRACKS, table_parts
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _MOST, _FEWEST = 300, 200  # points in a picture; new ones are looked for when fewer are left
 _APART_PX, _EDGE_PX = 20, 8

@@ -1,13 +1,12 @@
 """Bodies of the reconstructed people: fitted to their joints, as tables, and compared with true surfaces."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Bool, Float, Index, Int64
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, body_model
@@ -27,9 +26,6 @@ from pipelines.reconstruction.one_camera import (
 from pipelines.session.errors import DataError
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, MovingBody
 from pipelines.session.tables import BODY_ROTATION_COLUMNS, load_bodies
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # The spread of landmarks was measured with two rays at right angles: (1 + 1 + 1/2) / 3.
 TWO_RAYS_VARIANCE = 2.5 / 3
@@ -232,8 +228,6 @@ def _with_second_drone_mm(views: Views, result: Triangulation, pose_sigma: Float
 
 def body_parts(t_ns: Int64, bodies: Sequence[BodyFit | None]) -> Iterator[pd.DataFrame]:
     """Yield the rows of `tables.BODY` in parts of times, sorted by time, then person."""
-    import pandas as pd
-
     for start in range(0, len(t_ns), _TIMES_AT_ONCE):
         parts = [
             _rows(
@@ -247,8 +241,6 @@ def body_parts(t_ns: Int64, bodies: Sequence[BodyFit | None]) -> Iterator[pd.Dat
 
 
 def _rows(t_ns: Int64, person: int, body: BodyFit, chosen: Int64) -> pd.DataFrame:
-    import pandas as pd
-
     table = pd.DataFrame(
         {
             "t_ns": np.repeat(t_ns[body.row[chosen]], len(BONES)),
@@ -266,8 +258,6 @@ def _rows(t_ns: Int64, person: int, body: BodyFit, chosen: Int64) -> pd.DataFram
 
 def shape_rows(bodies: Sequence[BodyFit | None]) -> pd.DataFrame:
     """Make the rows of `tables.BODY_SHAPE`."""
-    import pandas as pd
-
     rows = [
         (person, name, value, sigma)
         for person, body in enumerate(bodies)

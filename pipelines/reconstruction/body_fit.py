@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Float, Index, Int64
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE_SIGMA, BodyModel, body_model
@@ -100,8 +101,6 @@ class Landmarks:
 @cache
 def _tables() -> dict[str, Landmarks]:
     """Read the landmarks of every kind of detector."""
-    import pandas as pd
-
     found = {}
     for kind, rows in pd.read_csv(_TABLE, comment="#").groupby("detector"):
         found[str(kind)] = Landmarks(

@@ -8,8 +8,6 @@ picture's stamp by its own velocity in the picture. So the camera's turning and 
 readout both count, and everything after that may take each picture for one of a single moment.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -16,9 +16,10 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import WHITE_SHARE, NoiseModel, PoseErrors, pose_errors
@@ -56,9 +57,6 @@ from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
 from pipelines.session.parallel import Waiting, available_bytes, each_part
 from pipelines.session.people import bones_of
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # The search for clock offsets uses at most so many times of the skeleton; more find no other offset.
 _SEARCHED = 300

@@ -5,15 +5,14 @@ figures that could not be measured. The verdict needs no truth: the error that t
 what limits it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from pyarrow import parquet
 
 from pipelines.geometry.arrays import Float, Int8, Int64
@@ -42,9 +41,6 @@ from pipelines.session.people import bones_of
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.storage import write_json
 from pipelines.session.tables import BONES, JOINT_ERRORS, write_table
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")
 _PER_JOINT = (
@@ -449,8 +445,6 @@ def joint_errors_table(
     per_joint: Mapping[str, Mapping[str, Any]], intervals_of: Mapping[str, Mapping[str, Any]]
 ) -> pd.DataFrame:
     """Build the rows of `tables.JOINT_ERRORS`: one for each joint and figure."""
-    import pandas as pd
-
     rows = []
     for joint, figures in per_joint.items():
         plain = {name: value for name, value in figures.items() if not isinstance(value, Mapping)}
@@ -463,8 +457,6 @@ def joint_errors_table(
 
 
 def _bones_table(bones: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    import pandas as pd
-
     return pd.DataFrame([{"bone": name, **of} for name, of in bones.items()], columns=BONES.names)
 
 
@@ -474,8 +466,6 @@ _TIMES_AT_ONCE = 8192
 
 def skeleton_parts(observations: Observations, result: Triangulation) -> Iterator[pd.DataFrame]:
     """Yield the rows of `tables.SKELETON` in parts: every joint of every person at every time."""
-    import pandas as pd
-
     times, people, joints, _ = observations.confidence.shape
     names = np.array(observations.joints, dtype=object)
     for start in range(0, times, _TIMES_AT_ONCE):
@@ -519,8 +509,6 @@ def angles_parts(observations: Observations, views: Views, result: Triangulation
     Standard deviations rest on `own_covariance`, without the errors of camera poses, which move and turn the
     person as a whole and hardly change an angle. `_CORRELATED` accounts for the correlation of the rest.
     """
-    import pandas as pd
-
     times, people, joints, _ = observations.confidence.shape
     scale = _residual_scale(views, result)
     names = np.array(list(ANGLES), dtype=object)
@@ -597,8 +585,6 @@ def _residual_scale(views: Views, result: Triangulation) -> float:
 
 def gait_of(observations: Observations, result: Triangulation) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Find the gait of every person: the rows of `tables.GAIT`, and by person a summary or None."""
-    import pandas as pd
-
     times, people, joints, _ = observations.confidence.shape
     position = result.points.reshape(times, people, joints, 3)
     parts: list[pd.DataFrame] = [_gait_rows(observations.t_ns[:0], 0, None)]
@@ -611,8 +597,6 @@ def gait_of(observations: Observations, result: Triangulation) -> tuple[pd.DataF
 
 
 def _gait_rows(t_ns: Int64, person: int, events: GaitEvents | None) -> pd.DataFrame:
-    import pandas as pd
-
     row = np.zeros(0, np.int64) if events is None else events.row
     table = pd.DataFrame({"t_ns": t_ns[row], "person": np.full(len(row), person)})
     kept = events or GaitEvents(row, row, row > 0, np.zeros((0, 3)), *np.zeros((3, 0)))
@@ -633,8 +617,6 @@ def camera_poses_table(cameras: Sequence[Camera], between: Interpolation) -> pd.
 
 def poses_table(cameras: Sequence[Camera], poses: Sequence[tuple[Float, Float]]) -> pd.DataFrame:
     """Build the same rows from each camera's poses at its pictures: position [F, 3], rotation [F, 3, 3]."""
-    import pandas as pd
-
     parts = []
     for camera, (position, rotation) in zip(cameras, poses, strict=True):
         (posed,) = np.nonzero(np.isfinite(position[:, 0]))

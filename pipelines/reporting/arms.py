@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64
@@ -47,9 +47,6 @@ from pipelines.reporting.wording import (
     with_interval,
 )
 from pipelines.session.records import Occupancy
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Drones pass obstacles at this distance, so that more of the map would only make the drawing smaller.
 MAP_MARGIN_M = 12.0

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from xml.sax.saxutils import escape
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.reporting.content import SessionContent
@@ -276,8 +277,6 @@ class Figure:
 
 def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
     """Write rows by column; columns in which no row has anything are left out."""
-    import pandas as pd
-
     numbers = pd.DataFrame(rows).dropna(axis="columns", how="all")
     texts = numbers.select_dtypes(exclude="number").map(cell_text)
     written: str = numbers.assign(**texts).to_csv(index=False, float_format="%.9g", lineterminator="\n")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64
@@ -14,9 +15,6 @@ from pipelines.geometry.metrics import bone_lengths
 from pipelines.geometry.triangulation import STATUS
 from pipelines.session.description import Description
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Occupancy
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Joints are stored as this part of a picture's side, which fits 16 bits and is finer than a pixel.
 FULL_SCALE = 10_000
@@ -155,8 +153,6 @@ class MeasuredMotion:
 
 def motion_from_skeleton(table: pd.DataFrame) -> MeasuredMotion:
     """Make dense arrays of a skeleton table (tables.SKELETON), in any order of its rows."""
-    import pandas as pd
-
     t_ns, time = np.unique(table["t_ns"].to_numpy(dtype=np.int64), return_inverse=True)
     persons, person = np.unique(table["person"].to_numpy(dtype=np.int64), return_inverse=True)
     joint, joints = pd.factorize(table["joint"])
@@ -279,8 +275,6 @@ def standing_heights(motion: MeasuredMotion) -> Float:
     last time before, else of the first after. Whoever was never measured stands as high as the others'
     median; without anybody it is 0.
     """
-    import pandas as pd
-
     height = motion.measured_position[..., 2]
     lowest = np.where(np.isfinite(height), height, np.inf).min(axis=-1)
     table = pd.DataFrame(np.where(np.isinf(lowest), np.nan, lowest), index=pd.to_datetime(motion.t_ns))

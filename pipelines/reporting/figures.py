@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import rotate
@@ -45,9 +45,6 @@ from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import STATUS_LABELS, joint_label, shortened
 from pipelines.session.records import Trajectory
 from pipelines.session.tables import trajectory_from
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Panels half as wide as the page show no more stretches of time.
 MOST_BINS_OF_HALF = 150

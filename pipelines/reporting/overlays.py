@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics, Picture, known_median, nearest_rows
@@ -43,10 +43,6 @@ from pipelines.session.tables import (
     read_table,
     trajectory_from,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 ReadFrame = Callable[[str, int], Picture | None]
 """Function that returns the picture of a camera's frame; None where there is none."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -46,10 +45,6 @@ from pipelines.session.camera_poses import logged_covariance
 from pipelines.session.description import CameraEntry, ClockEntry, Description, Doubt
 from pipelines.session.people import true_joints_at
 from pipelines.session.tables import figures_by_joint, motion_from, trajectory_from
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 # Keypoints below this confidence are left out by `reconstruct` where its record states no other.
 DEFAULT_MIN_CONFIDENCE = 0.3

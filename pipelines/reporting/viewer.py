@@ -11,9 +11,9 @@ import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.body_model import ABOVE, BELOW, body_model
@@ -35,9 +35,6 @@ from pipelines.session.camera_poses import poses_at
 from pipelines.session.people import DERIVED, bones_of
 from pipelines.session.records import MovingBody, Trajectory
 from pipelines.session.tables import trajectory_from
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Longer flights are thinned out, so that a page with 15 MB of pictures stays below 25 MB in base64.
 MAX_BYTES = 6_000_000

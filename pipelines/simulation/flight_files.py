@@ -5,14 +5,13 @@ their fields plain numbers by name; a stamp is nanoseconds since the epoch, and 
 left out. Axes are the world's, east-north-up.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.body_model import SHAPE, body_model, shape_of
@@ -30,9 +29,6 @@ from pipelines.simulation.flight import (
     visible_joints,
 )
 from pipelines.simulation.flying import LEVER_ARM
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # The box of a person detector is about this much larger than the extent of the joints.
 _BOX_MARGIN = 0.15
@@ -138,8 +134,6 @@ def write_truth(folder: Path, flight: SimulatedFlight) -> None:
 
 def true_bodies(flight: SimulatedFlight) -> pd.DataFrame:
     """Make the rows of `tables.BODY`, without covariances."""
-    import pandas as pd
-
     unknown = dict.fromkeys((*POINT_COVARIANCE_COLUMNS, *BODY_ROTATION_COLUMNS), np.nan)
     tables = []
     for number, each in enumerate(flight.people):
@@ -154,8 +148,6 @@ def true_bodies(flight: SimulatedFlight) -> pd.DataFrame:
 
 def true_shapes(flight: SimulatedFlight) -> pd.DataFrame:
     """Make the rows of `tables.BODY_SHAPE`, with standard deviations of 0."""
-    import pandas as pd
-
     looks = [each.look.body for each in flight.people]
     rows = [
         (number, name, value, 0.0)

@@ -1,7 +1,5 @@
 """Rows of text tables and logs: numbers, time stamps, and the rows that are dropped."""
 
-from __future__ import annotations
-
 import csv
 import re
 from bisect import bisect_left
@@ -10,15 +8,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from decimal import ROUND_HALF_UP, Decimal, InvalidOperation
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
 """Units of time, each as the power of ten by which it exceeds a nanosecond."""
@@ -68,8 +64,6 @@ def parse_table(
     first row has no dot but in a date, commas before digits are decimal. `text` and `numbers` map names to
     columns; blank and "nan" are NaN.
     """
-    import pyarrow as pa
-
     body = re.sub(r"\n[ \t]*#[^\n]*", "\n", "\n" + body)[1:]
     if delimiter in ";\t" and "." not in _DATE.sub("", (body.strip() + "\n").partition("\n")[0]):
         body = re.sub(r",(?=\d)", ".", body)
@@ -100,7 +94,6 @@ def parse_table(
 def _parse_csv(
     body: str, delimiter: str, columns: int, text: dict[str, int], numbers: dict[str, int]
 ) -> pa.Table:
-    import pyarrow as pa
     import pyarrow.csv
 
     types = {str(index): pa.string() for index in text.values()}
@@ -275,8 +268,6 @@ def rows_below(
 
 def _joined(seconds: pa.ChunkedArray, nanoseconds: pa.ChunkedArray) -> pa.ChunkedArray:
     """Join whole seconds and nanoseconds to decimal seconds; blank where one of them is no whole number."""
-    import pyarrow.compute as pc
-
     whole, rest = (
         pc.replace_substring_regex(pc.utf8_trim_whitespace(column), r"\.0*$", "")
         for column in (seconds, nanoseconds)

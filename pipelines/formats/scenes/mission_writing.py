@@ -14,6 +14,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import pandas as pd
 
 from pipelines.formats.common.exporting import safe_file_name, thinned
 from pipelines.formats.scenes.mcap_writing import Ros2Recording, topics_of
@@ -386,8 +387,6 @@ def _add(parent: ET.Element, values: _Values) -> None:
 
 
 def _write_setpoints(path: Path, flight: _Flight) -> None:
-    import pandas as pd
-
     velocity = np.gradient(flight.ned, flight.t_s, axis=0)
     moved = [flight.ned, velocity, np.gradient(velocity, flight.t_s, axis=0)]
     rows = thinned((flight.t_s * 1e9).astype(np.int64), _SETPOINTS_HZ)

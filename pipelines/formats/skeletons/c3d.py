@@ -6,16 +6,15 @@ millimetres up to 255. Header and POINT:FRAMES count to 65535; larger numbers ar
 frame in MOCAP:FIRST_T_NS and LAST_T_NS, as text because C3D's numbers are too short.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import first_bytes
@@ -35,9 +34,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
 from pipelines.session.storage import as_data_error, damaged
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # A C3D is divided into blocks of this many bytes.
 _BLOCK = 512

@@ -1,14 +1,14 @@
 """Files of joints: unit and axes, names of markers, a constant rate; joints as CSV, angles as CSV and STO."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from pipelines.formats.common.exporting import (
     file_names_of_people,
@@ -38,10 +38,6 @@ from pipelines.session.people import SKELETONS, joint_called
 from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
 from pipelines.session.storage import damaged, read_text
-
-if TYPE_CHECKING:
-    import pandas as pd
-    import pyarrow as pa
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 AXES = ("z-up", "y-up")
@@ -335,9 +331,6 @@ def _find_heading(text: str) -> Heading | None:
 
 def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
     """Return people [N] as whole numbers; 0 if the file has no such column."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     if column is None:
         return np.zeros(rows, dtype=np.int64)
     try:
@@ -351,8 +344,6 @@ def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
 
 
 def _dense(path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, position: Float) -> JointMotion:
-    import pandas as pd
-
     t_ns, row = np.unique(stamps, return_inverse=True)
     persons, person = np.unique(people, return_inverse=True)
     joint, joints = pd.factorize(pd.Series(names.to_pylist(), dtype=object).fillna("").str.strip())
@@ -382,8 +373,6 @@ def _dense(path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, pos
 
 def write_joints(path: Path, motion: JointMotion) -> None:
     """Write `t_ns,person,joint,x,y,z` and all other known values (covariance in m^2); NaN is blank."""
-    import pandas as pd
-
     people, joints = motion.position.shape[1:3]
     with path.open("w", encoding="utf-8", newline="") as file:
         for first in range(0, max(len(motion.t_ns), 1), _TIMES_AT_ONCE):

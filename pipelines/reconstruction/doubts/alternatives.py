@@ -4,8 +4,6 @@ An alternative has a price that grows with its freedom: for how many there are o
 numbers. So of two that explain as much, the one with less freedom is named first. Nothing is weighed here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial

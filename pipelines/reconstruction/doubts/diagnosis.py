@@ -6,8 +6,6 @@ less the price of the alternative. The best is named if that is enough, and if n
 none is, the doubt is stated without a cause.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The lines of flight.yaml that undo a mistake, as `cameras.drone1.clock: {offset_s: 0.3}`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache
 from io import StringIO

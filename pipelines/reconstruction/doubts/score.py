@@ -8,8 +8,6 @@ Lower is better. A score adds three things:
   its stated standard deviation as prior. Clocks and wrong conventions leave it, constant errors do not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
