@@ -59,7 +59,7 @@ from pipelines.session.tables import (
     write_table,
 )
 from pipelines.session.urls import as_urls, located, media_path, named
-from pipelines.sources.attitudes import FilmOfCamera, TurnedByPictures, turned_by_pictures
+from pipelines.sources.attitudes import MAP_FILES, FilmOfCamera, TurnedByPictures, turned_by_pictures
 from pipelines.sources.attitudes import load_map as load_picture_map
 from pipelines.sources.attitudes import store_map as store_picture_map
 from pipelines.sources.cameras import FlightCameras
@@ -358,13 +358,18 @@ class _FlightReader:
 
         def kept(key: str) -> PictureMap | None:
             before = usable_record(self._session / INGEST.name / "stage.json")
-            stored = f"cameras/{name}/picture_map.parquet"
-            path = self._session / stored
-            digest = sha256_of(path) if path.is_file() else None
-            if self.force or before is None or digest is None or before.outputs.get(stored) != digest:
+            if self.force or before is None:
                 return None
+            for stored in (f"cameras/{name}/{file}" for file in MAP_FILES):
+                path = self._session / stored
+                if not path.is_file() or before.outputs.get(stored) != sha256_of(path):
+                    return None
             entry = read_description(self._session).cameras[name].picture_map
-            return load_picture_map(path.parent, entry) if entry and entry.key == key else None
+            return (
+                load_picture_map(self._session / "cameras" / name, entry)
+                if entry and entry.key == key
+                else None
+            )
 
         return turned_by_pictures(
             f"{self._flight_path}: cameras.{name}",

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
 from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import (
     EXACT,
@@ -1021,7 +1021,8 @@ def background_of(camera: Camera, followed: Followed) -> Background:
     def between(first: int, stop: int) -> SeenPoints:
         parts = [SeenPoints(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))]
         for tracks in followed.between(first, stop):
-            rays = _rays(tracks, camera, t_ns)  # of whole parts: velocities need the neighbours
+            # Of whole parts: velocities need the neighbours.
+            rays = rays_at_stamps(tracks, camera.intrinsics, t_ns)
             parts.append(SeenPoints(tracks.picture, tracks.point, rays).between(first, stop))
         picture, point, rays = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("picture", "point", "rays")
@@ -1032,15 +1033,15 @@ def background_of(camera: Camera, followed: Followed) -> Background:
     return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened)
 
 
-def _rays(tracks: Tracks, camera: Camera, t_ns: Int64) -> Float:
+def rays_at_stamps(tracks: Tracks, intrinsics: Intrinsics, t_ns: Int64) -> Float:
     """Compute the viewing rays [K, 2] of followed points at the stamps [T] of their pictures.
 
     Points of a rolling shutter go on from their rows' times by their own velocities.
     """
-    rays = undistort(tracks.xy, camera.intrinsics)
-    if not camera.intrinsics.readout_s:
+    rays = undistort(tracks.xy, intrinsics)
+    if not intrinsics.readout_s:
         return rays
-    delay_s = row_delay_s(tracks.xy[:, 1], camera.intrinsics)
+    delay_s = row_delay_s(tracks.xy[:, 1], intrinsics)
     order = np.lexsort((tracks.picture, tracks.point))
     point, picture = tracks.point[order], tracks.picture[order]
     follows = (np.diff(point) == 0) & (np.diff(picture) == 1)

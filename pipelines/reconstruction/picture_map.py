@@ -1,10 +1,11 @@
-"""Attitudes of one camera from its pictures: a map of key pictures, laid on the places that a log has.
+"""Attitudes of one camera from its pictures: a map of key pictures, adjusted on the places that a log has.
 
-Key pictures are chosen by time. pycolmap maps them: SIFT features, matches of pictures at several
-distances in time, incremental mapping (Schönberger and Frahm 2016). The map depends on the pictures and the
-lens alone, so it is kept while places, clocks and noise change. A similarity lays it on the logged places by
-generalised least squares: position errors of a log are correlated in time, and a level horizon binds the roll
-about a straight path. Its covariance is that of the attitudes' common error.
+Key pictures are chosen by time. Points are followed from each to the next ones through all pictures of a
+film; pictures that are too far apart in time for that are matched by SIFT features. COLMAP's global mapper
+(Pan et al. 2024) maps them. The map depends on the pictures and the lens alone, so it is kept while places,
+clocks and noise change. A similarity lays it on the logged places, roughly. One bundle adjustment then has
+the sightings, the places with errors that are correlated in time, and a level horizon as evidence. Its
+covariance is that of the attitudes.
 
 Each camera is mapped by itself: views of two drones that are 90 degrees apart share too little, and a joint
 map of the sample flight was wrong by 6 m.
@@ -22,18 +23,22 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Index, Int64, Intrinsics, Picture
 from pipelines.geometry.cameras import undistort
-from pipelines.geometry.noise import ROTATION, PoseErrors, Process
+from pipelines.geometry.noise import ROTATION, PoseErrors
 from pipelines.geometry.poses import (
     continuous_signs,
+    cross_matrix,
     interpolate_points,
+    matrix_from_quaternion,
     multiply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
     rotate,
 )
+from pipelines.reconstruction.background import rays_at_stamps
+from pipelines.reconstruction.background_tracks import Tracks
 
 # Another number of features, pairs or key pictures gives other maps: kept maps of an older one are not used.
-REVISION = 1
+REVISION = 2
 
 # --- which pictures, and what is matched -----------------------------------------------------------------
 
@@ -43,8 +48,15 @@ KEY_PICTURES_OF_SHORT_FILM = 60
 MIN_KEY_STEP_S = 0.2
 # Two pictures a second keep a minute of film below 60 s of processor time, and overlap while a gimbal pans.
 MAX_KEY_STEP_S = 0.5
-# Features of smaller pictures are as accurate in the map as those of whole ones, at a quarter of the time.
-LONGER_SIDE_PX = 800
+# Points in smaller pictures are as accurate in the map as those in whole ones, in less time.
+LONGER_SIDE_PX = 1280
+# Points are followed through this many pictures a second: with fewer they move too far.
+FOLLOWED_HZ = 30.0
+# Pictures further apart are photographs, whose points cannot be followed.
+MAX_FOLLOWED_STEP_S = 0.2
+# Pairs of key pictures nearer than this have so little parallax that their geometry is ambiguous: with them,
+# two of twenty cameras of rendered flights were mapped as a mirrored scene.
+MIN_PAIR_STEPS = 3
 # More features cost more matching (quadratic) and bind a picture no better.
 MAX_FEATURES = 1000
 # Key pictures are matched with those this many steps later; the far ones have the parallax.
@@ -57,9 +69,8 @@ MAX_RATIO = 0.8
 MAX_DESCRIPTOR_ANGLE_RAD = 0.7
 # Fewer matches of two pictures are chance (COLMAP's default).
 MIN_MATCHES = 15
-# A map starts from two pictures whose rays meet at this angle: below, depth is noise. COLMAP's 16 deg asks
-# for more than a drone that looks ahead flies in some seconds.
-MIN_START_ANGLE_DEG = 4.0
+# Two sightings of a point test nothing.
+MIN_SIGHTINGS = 3
 # Any seed serves: the same one gives the same map.
 SEED = 1
 
@@ -76,12 +87,29 @@ MAX_FOCAL_DISAGREEMENT = 0.02
 # Attitudes with a larger common error start the estimate outside of its convergence (20 deg: 1 of 2 failed).
 MAX_ATTITUDE_SIGMA_DEG = 10.0
 # Residuals of a right map are those of the places: beyond three times their stated errors (a mean square of
-# 9) the map is wrong. Rendered flights with blurred pictures gave such maps, with attitudes off by 10 to 80
-# deg.
+# 9) the map is wrong.
 MAX_MISFIT = 9.0
-# Above this mean square the map is bent, slowly: over a quarter of the film. Far fewer numbers then speak of
-# the rotation; taken for white, such residuals gave attitudes off by three to four standard deviations.
-BENT_MISFIT = 2.0
+# A sighting this far from its point does not fit: followed points err by 0.4 px.
+FAR_PX = 2.0
+# Of right maps at most 10 % of the sightings are far, of wrong ones 26 % and more (20 rendered cameras).
+MAX_FAR_SHARE = 0.16
+# Loss of sightings in the rounds of the adjustment, px: the map's bend first, the points' errors last.
+LOSS_ROUNDS_PX = (30.0, 6.0, 2.0)
+# Followed points drift together with their neighbours, and keep their error for a second. So many sightings
+# count as one: with it attitudes of rendered flights err by their standard deviations.
+SIGHTINGS_ALIKE = 64.0
+# Sightings err by this where residuals are smaller (features of photographs).
+MIN_SIGHTING_PX = 0.2
+# An adjustment of the start of a right map takes ten steps.
+MAX_STEPS = 30
+# A tenth of the smallest standard deviation of an attitude.
+CONVERGED_RAD = 1e-4
+# Nothing that pictures show is nearer.
+MIN_DEPTH_M = 0.1
+# Rays that are nearer to parallel start their point by it where the camera is.
+MIN_SQUARED_ANGLE = 1e-6
+# Points are known to 300 m at worst, which is far enough for any.
+MIN_POINT_PRECISION = 1e-5
 # Where nobody states the places' errors, a map that misses them by more of its size is taken for a wrong one.
 MAX_UNSTATED_SHARE = 0.03
 # Gimbals hold their horizon to this, and so does the mean of a camera on a drone that banks both ways.
@@ -90,10 +118,6 @@ LEVEL_SIGMA_DEG = 2.0
 TRIED_TURN_DEG = 15.0
 # Cameras that look between 73 deg up and 17 deg beyond straight down are upright: atan(1 / 0.3) is 73 deg.
 LOOKING_DOWN_WEIGHT = 0.3
-# Attitudes in a map wander by this between neighbours (sample and rendered flights, 60 key pictures).
-MAP_SIGMA_DEG = 0.05
-# A map bends: with exact places the common error is this (0.13 and 0.15 deg on the sample's two films).
-BENT_MAP_SIGMA_DEG = 0.12
 # An interpolated picture is between key pictures at half the distance that `_bridge_sigma` measures: a smooth
 # motion errs by a quarter, a rough one by half.
 SHARE_OF_DOUBLE_STEP = 1 / 3
@@ -113,10 +137,11 @@ class NoAttitudesError(ValueError):
 
 @dataclass(frozen=True)
 class KeyFeatures:
-    """Features of a key picture."""
+    """Points in a key picture."""
 
     xy: Float  # [F, 2] x/z and y/z, without distortion
-    descriptors: Picture  # [F, 128]
+    descriptors: Picture  # [F, 128] of photographs; [F, 0] of films
+    point: Int64  # [F] numbers of followed points, increasing; [0] of photographs
 
 
 @dataclass(frozen=True)
@@ -126,8 +151,9 @@ class PictureMap:
     key: Int64  # [K] index of each among the key pictures, increasing
     position: Float  # [K, 3]
     quaternion_xyzw: Float  # [K, 4] map_from_camera
-    points: int
-    error_px: float  # mean reprojection error, in pixels of the whole picture
+    seen_in: Int64  # [N] of each sighting its picture, among the K
+    seen_point: Int64  # [N] its point, from 0
+    seen_xy: Float  # [N, 2] x/z and y/z, with the refined focal length
     focal_ratio: float = 1.0  # refined focal length over the one that was given
 
     @property
@@ -144,6 +170,7 @@ class LaidMap:
     position: Float  # [K, 3] m
     quaternion_xyzw: Float  # [K, 4] world_from_camera
     residual_m: float  # root mean square distance of the log's places from the map
+    error_px: float  # median reprojection error
     common_sigma_rad: float  # per axis, of the error that all attitudes share
     picture_sigma_rad: float  # per axis, of the error of each picture, interpolated ones included
 
@@ -156,23 +183,69 @@ def key_rows(t_ns: Int64) -> Index:
     return np.unique(np.searchsorted(t_ns, wanted).clip(max=len(t_ns) - 1))
 
 
-def features_of(picture: Picture, intrinsics: Intrinsics) -> KeyFeatures:
-    """Find SIFT features in a picture, [H, W, 3] BGR or grey."""
+def is_film(t_ns: Int64) -> bool:
+    """Test if pictures of these times [T] are near enough to follow points through them."""
+    return float(np.median(np.diff(t_ns))) <= MAX_FOLLOWED_STEP_S * 1e9
+
+
+def rows_of_film(t_ns: Int64, keys: Index) -> Index:
+    """Choose the rows of a film, of times [T], through which points are followed, with these key rows."""
+    step = max(1, round(1e9 / FOLLOWED_HZ / float(np.median(np.diff(t_ns)))))
+    return np.union1d(np.arange(0, len(t_ns), step), keys)
+
+
+def shrinkage(width: int, height: int) -> float:
+    """Return the scale of pictures in which points are found."""
+    return min(LONGER_SIDE_PX / max(width, height), 1.0)
+
+
+def shrunk(picture: Picture) -> Picture:
+    """Return a picture, [H, W, 3] BGR or grey, in grey and at most `LONGER_SIDE_PX` long."""
     import cv2
 
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    height, width = grey.shape
-    share = min(LONGER_SIDE_PX / max(height, width), 1.0)
+    share = shrinkage(*grey.shape)
     if share < 1:
         grey = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+    return np.asarray(grey, np.uint8)
+
+
+def followed_features(
+    tracks: Tracks, rows: Index, keys: Index, intrinsics: Intrinsics, t_ns: Int64
+) -> list[KeyFeatures]:
+    """Return the points of each key picture.
+
+    Args:
+        tracks: points in shrunk pictures; they count the followed ones.
+        rows: [P] rows of the followed pictures.
+        keys: rows of the key pictures, among them.
+        intrinsics: the lens.
+        t_ns: times of all rows.
+    """
+    whole = replace(tracks, xy=(tracks.xy + 0.5) / shrinkage(intrinsics.width, intrinsics.height) - 0.5)
+    rays = rays_at_stamps(whole, intrinsics, t_ns[rows])
+    features = []
+    for picture in np.searchsorted(rows, keys).tolist():
+        mine = np.flatnonzero((tracks.picture == picture) & np.isfinite(rays).all(axis=1))
+        mine = mine[np.argsort(tracks.point[mine])]
+        features.append(KeyFeatures(rays[mine], np.empty((len(mine), 0), np.uint8), tracks.point[mine]))
+    return features
+
+
+def features_of(picture: Picture, intrinsics: Intrinsics) -> KeyFeatures:
+    """Find SIFT features in a photograph, [H, W, 3] BGR or grey."""
+    import cv2
+
+    grey = shrunk(picture)
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, contrastThreshold=0.02)
     points, descriptors = sift.detectAndCompute(grey, None)
     if descriptors is None:
-        return KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8))
+        return KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8), np.empty(0, np.int64))
+    share = shrinkage(*picture.shape[:2])
     pixels = (np.array([point.pt for point in points], np.float64) + 0.5) / share - 0.5
     xy = undistort(pixels, intrinsics)
     known = np.isfinite(xy).all(axis=1)
-    return KeyFeatures(xy[known], np.asarray(descriptors[known], np.uint8))
+    return KeyFeatures(xy[known], np.asarray(descriptors[known], np.uint8), np.empty(0, np.int64))
 
 
 def map_pictures(
@@ -206,13 +279,11 @@ def map_pictures(
         pycolmap.geometric_verification(
             place / "features.db", verifier_options=one, two_view_geometry_options=verifying
         )
-        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=SEED, extract_colors=False)
-        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = refine_focal
-        options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
-        options.mapper.init_min_tri_angle = MIN_START_ANGLE_DEG
-        options.max_num_models, options.min_model_size = 3, MIN_MAPPED_PICTURES
+        options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=SEED)
+        options.mapper.bundle_adjustment.refine_focal_length = refine_focal
+        options.mapper.bundle_adjustment.refine_extra_params = False
         (place / "maps").mkdir()
-        found = pycolmap.incremental_mapping(place / "features.db", place, place / "maps", options=options)
+        found = pycolmap.global_mapping(place / "features.db", place, place / "maps", options=options)
     model = max(found.values(), key=lambda each: each.num_reg_images(), default=None)
     mapped = 0 if model is None else model.num_reg_images()
     if model is None or mapped < max(MIN_MAPPED_PICTURES, MIN_MAPPED_SHARE * len(features)):
@@ -222,16 +293,57 @@ def map_pictures(
         )
     if refine_focal and not _determines_focal(model):
         return map_pictures(features, intrinsics)
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda i: i.name)
-    poses = [image.cam_from_world().inverse() for image in images]
-    refined = next(iter(model.cameras.values())).params[0]
+    return _read_model(model, features, focal_px)
+
+
+def _read_model(model: Any, features: Sequence[KeyFeatures], focal_px: float) -> PictureMap:
+    """Read a model of COLMAP, with all sightings of its points and the pictures of a film that it lacks."""
+    import pycolmap
+
+    camera = next(iter(model.cameras.values()))
+    images = {int(image.name): image for image in model.images.values() if image.has_pose}
+    names = [np.full(len(each.xy), -1, np.int64) for each in features]
+    for number, image in images.items():
+        for feature, point in enumerate(image.points2D):
+            if point.has_point3D():
+                names[number][feature] = point.point3D_id
+    if any(len(each.point) for each in features):
+        known = {
+            int(point): name
+            for number in images
+            for point, name in zip(features[number].point, names[number].tolist(), strict=True)
+            if name >= 0
+        }
+        names = [np.array([known.get(int(point), -1) for point in each.point]) for each in features]
+    poses = {number: image.cam_from_world() for number, image in images.items()}
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.random_seed = SEED
+    for number in set(range(len(features))) - set(poses):
+        mine = np.flatnonzero(names[number] >= 0)
+        if len(mine) >= MIN_MATCHES:
+            pixels = features[number].xy[mine] * focal_px + camera.params[1:3]
+            there = np.array([model.points3D[name].xyz for name in names[number][mine]])
+            found = pycolmap.estimate_and_refine_absolute_pose(pixels, there, camera, options)
+            if found is not None:
+                poses[number] = found["cam_from_world"]
+    key = sorted(poses)
+    placed = [poses[number].inverse() for number in key]
+    often = (
+        np.bincount(np.concatenate([names[number][names[number] >= 0] for number in key])) >= MIN_SIGHTINGS
+    )
+    seen = [(names[number] >= 0) & often[names[number]] for number in key]
+    ratio = float(camera.params[0] / focal_px)
     return PictureMap(
-        key=np.array([int(image.name) for image in images], np.int64),
-        position=np.array([pose.translation for pose in poses]),
-        quaternion_xyzw=continuous_signs(np.array([pose.rotation.quat for pose in poses])),
-        points=model.num_points3D(),
-        error_px=float(model.compute_mean_reprojection_error()),
-        focal_ratio=float(refined / focal_px),
+        np.array(key, np.int64),
+        np.array([pose.translation for pose in placed]),
+        continuous_signs(np.array([pose.rotation.quat for pose in placed])),
+        np.repeat(np.arange(len(key)), [int(each.sum()) for each in seen]),
+        np.unique(
+            np.concatenate([names[number][each] for number, each in zip(key, seen, strict=True)]),
+            return_inverse=True,
+        )[1],
+        np.concatenate([features[number].xy[each] for number, each in zip(key, seen, strict=True)]) / ratio,
+        ratio,
     )
 
 
@@ -286,14 +398,21 @@ def _write_features(
         pixels = found.xy * focal_px + [width / 2, height / 2]
         database.write_keypoints(image.image_id, pixels.astype(np.float32))
         ids.append(image.image_id)
-    units = [_unit(found.descriptors) for found in features]
     matched, count = 0, len(features)
-    steps = PAIR_STEPS if count > MAX_PICTURES_FOR_ALL_PAIRS else range(1, count)
+    film = any(len(each.point) for each in features)
+    steps: Sequence[int] = PAIR_STEPS
+    if film or count <= MAX_PICTURES_FOR_ALL_PAIRS:
+        steps = range(MIN_PAIR_STEPS if film else 1, count)
+    units = [_unit(each.descriptors) for each in features]
     for first in range(count):
         for second in (first + step for step in steps if first + step < count):
-            matches = match_features(units[first], units[second])
+            if film:
+                one, other = features[first].point, features[second].point
+                matches = np.stack(np.intersect1d(one, other, return_indices=True)[1:], axis=1)
+            else:
+                matches = match_features(units[first], units[second])
             if len(matches) >= MIN_MATCHES:
-                database.write_matches(ids[first], ids[second], matches)
+                database.write_matches(ids[first], ids[second], matches.astype(np.uint32))
                 matched += 1
     database.close()
     return matched
@@ -309,10 +428,10 @@ def _unit(descriptors: Picture) -> Float32:
 def match_features(ones: Float32, others: Float32) -> Index:
     """Match unit descriptors [F, 128] and [G, 128]: nearest both ways, and clearly nearer than the second.
 
-    Returns rows [M, 2] of uint32.
+    Returns rows [M, 2].
     """
     if len(ones) < 2 or len(others) < 2:
-        return np.empty((0, 2), np.uint32)
+        return np.empty((0, 2), np.int64)
     alike = ones @ others.T
     rows = np.arange(len(ones))
     best = alike.argmax(axis=1)
@@ -321,7 +440,7 @@ def match_features(ones: Float32, others: Float32) -> Index:
     alike[rows, best] = -1
     angle, second = (np.arccos(np.clip(each, -1, 1)) for each in (nearest, alike.max(axis=1)))
     kept = (back[best] == rows) & (angle < MAX_RATIO * second) & (angle < MAX_DESCRIPTOR_ANGLE_RAD)
-    return np.stack([rows[kept], best[kept]], axis=1).astype(np.uint32)
+    return np.stack([rows[kept], best[kept]], axis=1)
 
 
 # --- laying a map on places ------------------------------------------------------------------------------
@@ -340,12 +459,18 @@ class _Similarity:
 
 
 def lay_on_places(
-    found: PictureMap, key_t_ns: Int64, t_ns: Int64, places: Float, errors: PoseErrors | None
+    found: PictureMap,
+    intrinsics: Intrinsics,
+    key_t_ns: Int64,
+    t_ns: Int64,
+    places: Float,
+    errors: PoseErrors | None,
 ) -> LaidMap:
     """Lay a map on the logged places of its camera.
 
     Args:
         found: the map.
+        intrinsics: the lens, as given for the map.
         key_t_ns: [P] times of all key pictures.
         t_ns: [N] times of the places.
         places: [N, 3] m in the world, z up.
@@ -364,27 +489,29 @@ def lay_on_places(
     if len(rows) < 4:
         raise NoAttitudesError(f"its log has {len(rows)} places while its pictures are mapped")
     seconds = (t_ns[rows] - at_ns[0]) / 1e9
-    mapped = CubicSpline((at_ns - at_ns[0]) / 1e9, found.position)(seconds)
-    logged = places[rows]
-    start, fits = _first_similarity(mapped, logged)
-    mapped, logged, seconds = mapped[fits], logged[fits], seconds[fits]
+    between = CubicSpline((at_ns - at_ns[0]) / 1e9, np.eye(len(at_ns)))(seconds)
+    start, fits = _first_similarity(between @ found.position, places[rows])
+    between, logged, seconds = between[fits], places[rows][fits], seconds[fits]
     unstated = errors is None
     if errors is None:
-        level = max(float(np.sqrt(np.square(start.places(mapped) - logged).mean())), 1e-3)
+        level = max(float(np.sqrt(np.square(start.places(between @ found.position) - logged).mean())), 1e-3)
         errors = PoseErrors((level, 0.0), ())
-    factor = cholesky(position_covariance(errors, seconds), lower=True)
-    start = _upright(start, mapped, logged, factor, found.quaternion_xyzw)
-    fit, spread, misfit = _fitted(start, mapped, logged, factor, found.quaternion_xyzw)
-    if BENT_MISFIT < misfit <= MAX_MISFIT:  # what the places do not explain is a bend of the map, and slow
-        bend = PoseErrors((0.0, 0.0), (Process(0, 1.0, correlation_s=float(np.ptp(seconds)) / 4),))
-        apart = fit.places(mapped) - logged
-        covariance = position_covariance(errors, seconds)
-        excess = max(float(np.square(apart).mean() - np.diagonal(covariance).mean()), 0.0)
-        factor = cholesky(covariance + excess * position_covariance(bend, seconds), lower=True)
-        fit, spread, _ = _fitted(fit, mapped, logged, factor, found.quaternion_xyzw)
-    residual_m = float(np.sqrt(np.square(fit.places(mapped) - logged).sum(axis=1).mean()))
-    largest_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(spread)[-1])))
-    share = residual_m / (fit.scale * found.size)
+    covariance = position_covariance(errors, seconds)
+    factor = cholesky(covariance, lower=True)
+    start = _upright(start, between @ found.position, logged, factor, found.quaternion_xyzw)
+    precision = np.asarray(np.linalg.inv(covariance), np.float64)
+    focal_px = found.focal_ratio * (intrinsics.fx * intrinsics.fy) ** 0.5
+    focal_px *= shrinkage(intrinsics.width, intrinsics.height)
+    fit = _adjusted(start, _Bundle(found, focal_px, between, logged, precision))
+    residual_m = float(np.sqrt(np.square(fit.apart).sum(axis=1).mean()))
+    misfit = float(np.einsum("ik,ij,jk->", fit.apart, precision, fit.apart)) / fit.apart.size
+    length_m = start.scale * found.size
+    share = residual_m / length_m
+    if fit.far_share > MAX_FAR_SHARE:
+        raise NoAttitudesError(
+            f"its map is wrong: with its places, {100 * fit.far_share:.0f} % of the points are"
+            f" {FAR_PX:g} px or more from where pictures show them (blurred pictures, or much that moves)"
+        )
     if misfit > MAX_MISFIT or (unstated and share > MAX_UNSTATED_SHARE):
         stated = "" if unstated else f" ({np.sqrt(misfit):.1f} times the errors of pose_noise)"
         raise NoAttitudesError(
@@ -392,21 +519,25 @@ def lay_on_places(
             " map is wrong (blurred pictures, little texture, another clock), or state larger errors of the"
             " places in pose_noise"
         )
+    # Each picture's error, and the mean over all pictures: what is left of the first is each picture's own.
+    turns = fit.covariance.reshape(len(at_ns), 6, len(at_ns), 6)[:, 3:, :, 3:] * max(misfit, 1.0)
+    common, each = turns.mean(axis=(0, 2)), np.einsum("kikj->ij", turns) / len(at_ns)
+    largest_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(each)[-1])))
     if largest_deg > MAX_ATTITUDE_SIGMA_DEG:
-        length_m = fit.scale * found.size
         raise NoAttitudesError(
             f"its places do not say how its map of {length_m:.2g} m lies in the world (standard deviation"
             f" {largest_deg:.0f} deg, residual {residual_m:.2g} m): fly further, in curves, or state smaller"
             " errors of the places in pose_noise"
         )
-    turned = multiply(fit.quaternion_xyzw, found.quaternion_xyzw)
+    own = max(float(np.trace(each - common)) / 3, 0.0) ** 0.5
     return LaidMap(
         at_ns,
-        fit.places(found.position),
-        continuous_signs(turned),
+        fit.position,
+        continuous_signs(fit.quaternion_xyzw),
         residual_m,
-        common_sigma_rad=float(np.hypot(np.sqrt(np.trace(spread) / 3), np.radians(BENT_MAP_SIGMA_DEG))),
-        picture_sigma_rad=float(np.hypot(np.radians(MAP_SIGMA_DEG), _bridge_sigma(at_ns, turned))),
+        fit.error_px,
+        common_sigma_rad=float(np.sqrt(np.trace(common) / 3)),
+        picture_sigma_rad=float(np.hypot(own, _bridge_sigma(at_ns, fit.quaternion_xyzw))),
     )
 
 
@@ -476,55 +607,154 @@ def position_covariance(errors: PoseErrors, seconds: Float) -> Float:
     return covariance
 
 
-def _fitted(
-    start: _Similarity, mapped: Float, logged: Float, factor: Float, quaternion_xyzw: Float
-) -> tuple[_Similarity, Float, float]:
-    """Refine a similarity by generalised least squares with a level horizon.
+@dataclass(frozen=True)
+class _AdjustedMap:
+    """Result of the bundle adjustment."""
 
-    `factor` is the lower Cholesky factor of the places' covariance along each axis [N, N].
+    position: Float  # [K, 3] m
+    quaternion_xyzw: Float  # [K, 4] world_from_camera
+    covariance: Float  # [6 K, 6 K] of each picture's position (m) and turn about the world's axes (rad)
+    apart: Float  # [N, 3] m: places of the log from the map
+    error_px: float  # median
+    far_share: float  # of the sightings
 
-    Returns the similarity, the covariance [3, 3] of its rotation about the world's axes, rad^2, and the mean
-    square of the residuals in standard deviations, with which the covariance grows.
-    """
-    from scipy.linalg import solve_triangular
 
-    across = rotate(quaternion_xyzw, np.array([1.0, 0.0, 0.0]))  # right in each picture, level without roll
-    level_sigma = np.radians(LEVEL_SIGMA_DEG) * np.sqrt(len(across))
-    fit = start
-    for _ in range(20):
-        turned = fit.scale * rotate(fit.quaternion_xyzw, mapped)
-        apart = logged - (turned + fit.shift)
-        columns = np.zeros((len(mapped), 3, 7))
-        columns[:, :, :3] = np.eye(3)
-        columns[:, :, 3] = turned
-        columns[:, :, 4:] = -_cross(turned)
-        whole = np.concatenate([columns, apart[:, :, None]], axis=2)
-        white = solve_triangular(factor, whole.reshape(len(mapped), -1), lower=True).reshape(-1, 8)
-        right = rotate(fit.quaternion_xyzw, across)
-        level = np.zeros((len(right), 8))
-        level[:, 4], level[:, 5] = right[:, 1], -right[:, 0]  # of the height of (turn x right)
-        level[:, 7] = -right[:, 2]
-        rows = np.concatenate([white, level / level_sigma])
-        information = rows[:, :7].T @ rows[:, :7]
-        step = np.linalg.solve(information, rows[:, :7].T @ rows[:, 7])
-        turn = quaternion_from_rotation_vector(step[4:])
-        fit = _Similarity(
-            fit.scale * float(np.exp(np.clip(step[3], -0.5, 0.5))),
-            multiply(turn, fit.quaternion_xyzw),
-            fit.shift + step[:3],
+@dataclass(frozen=True)
+class _Bundle:
+    """Evidence on the poses of K pictures and on P points: sightings, logged places and a level horizon."""
+
+    found: PictureMap
+    focal_px: float  # of shrunk pictures
+    between: Float  # [N, K] weights by which the pictures' places give those at the log's times
+    logged: Float  # [N, 3] m, places of the log
+    precision: Float  # [N, N] inverse of the covariance of their errors along each axis
+    loss_px: float = LOSS_ROUNDS_PX[0]
+    sigma_px: float = MIN_SIGHTING_PX
+
+    def residuals(self, at: Float, turn: Float, points: Float) -> tuple[Float, Float]:
+        """Return the residuals [N, 2] px of all sightings, and their points in the camera [N, 3]."""
+        picture, point = self.found.seen_in, self.found.seen_point
+        seen = np.einsum("nji,nj->ni", turn[picture], points[point] - at[picture])
+        seen[:, 2] = np.maximum(seen[:, 2], MIN_DEPTH_M)
+        return (self.found.seen_xy - seen[:, :2] / seen[:, 2:]) * self.focal_px, seen
+
+    def cost(self, at: Float, turn: Float, points: Float) -> float:
+        """Compute the sum of squares in standard deviations; of sightings by Cauchy's loss."""
+        squares = np.square(self.residuals(at, turn, points)[0] / self.loss_px).sum(axis=1)
+        apart = self.logged - self.between @ at
+        whole = np.log1p(squares).sum() * self.loss_px**2 / (SIGHTINGS_ALIKE * self.sigma_px**2)
+        whole += np.einsum("ik,ij,jk->", apart, self.precision, apart)
+        return float(whole + np.square(turn[:, 2, 0]).sum() / (np.radians(LEVEL_SIGMA_DEG) ** 2 * len(at)))
+
+    def equations(self, at: Float, turn: Float, points: Float) -> tuple[Any, ...]:
+        """Return the normal equations of poses [6 K, 6 K], [6 K], points [P, 3, 3], [P, 3], and both."""
+        from scipy.sparse import bsr_matrix
+
+        picture, point, count, focal_px = (
+            self.found.seen_in,
+            self.found.seen_point,
+            len(at),
+            self.focal_px,
         )
-        if np.abs(step[3:]).max() < 1e-9:
-            break
-    misfit = float(np.square(white[:, 7]).sum()) / max(len(white) - 7, 1)
-    spread = np.linalg.inv(information)[4:, 4:] * max(misfit, 1.0)
-    return fit, spread, misfit
+        off, seen = self.residuals(at, turn, points)
+        weight = 1 / (1 + np.square(off / self.loss_px).sum(axis=1)) / (SIGHTINGS_ALIKE * self.sigma_px**2)
+        project = np.zeros((len(off), 2, 3))
+        project[:, 0, 0] = project[:, 1, 1] = focal_px / seen[:, 2]
+        project[:, :, 2] = -focal_px * seen[:, :2] / np.square(seen[:, 2:])
+        of_point = project @ np.swapaxes(turn[picture], 1, 2)
+        of_turn = of_point @ cross_matrix(points[point] - at[picture])
+        of_pose = np.concatenate([-of_point, of_turn], axis=2)
+        weighed, weighed_point = (
+            np.swapaxes(weight[:, None, None] * each, 1, 2) for each in (of_pose, of_point)
+        )
+        of_each, pull = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        np.add.at(of_each, picture, weighed @ of_pose)
+        np.add.at(pull, picture, (weighed @ off[:, :, None])[:, :, 0])
+        own, push = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+        np.add.at(own, point, weighed_point @ of_point)
+        np.add.at(push, point, (weighed_point @ off[:, :, None])[:, :, 0])
+        order = np.lexsort((point, picture))
+        begins = np.append(0, np.cumsum(np.bincount(picture, minlength=count)))
+        shape = (6 * count, 3 * len(points))
+        mixed = bsr_matrix(((weighed @ of_point)[order], point[order], begins), shape=shape)
+        rows, along = np.arange(count), self.between.T @ self.precision
+        poses = np.zeros((count, 6, count, 6))
+        poses[rows, :, rows] = of_each
+        for axis in range(3):
+            poses[:, axis, :, axis] += along @ self.between
+        pull[:, :3] += along @ (self.logged - self.between @ at)
+        # The height of a picture's right-hand axis changes with turns about the world's x and y.
+        tilt = np.stack([turn[:, 1, 0], -turn[:, 0, 0]], axis=1)
+        level = 1 / (np.radians(LEVEL_SIGMA_DEG) ** 2 * count)
+        poses[rows, 3:5, rows, 3:5] += level * tilt[:, :, None] * tilt[:, None]
+        pull[:, 3:5] -= level * tilt * turn[:, 2, 0, None]
+        return poses.reshape(6 * count, -1), pull.ravel(), own, push.ravel(), mixed
 
 
-def _cross(vectors: Float) -> Float:
-    """Return the matrices [N, 3, 3] of cross products with vectors [N, 3]."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+def _adjusted(start: _Similarity, bundle: _Bundle) -> _AdjustedMap:
+    """Adjust poses and points (Levenberg-Marquardt); points are eliminated.
+
+    Cauchy's loss narrows, and the level of sightings is that of their residuals.
+    """
+    found = bundle.found
+    count = len(found.key)
+    at = start.places(found.position)
+    turn = matrix_from_quaternion(multiply(start.quaternion_xyzw, found.quaternion_xyzw))
+    points = _triangulated(found, at, turn)
+    for loss_px in LOSS_ROUNDS_PX:
+        error = np.linalg.norm(bundle.residuals(at, turn, points)[0], axis=1)
+        bundle = replace(bundle, loss_px=loss_px, sigma_px=max(float(np.median(error)), MIN_SIGHTING_PX))
+        damping, now = 1e-4, bundle.cost(at, turn, points)
+        for _ in range(MAX_STEPS):
+            poses, pull, own, push, mixed = bundle.equations(at, turn, points)
+            while damping < 1:
+                inverse = _inverse_blocks(own * (1 + damping * np.eye(3)))
+                reduced = poses + damping * np.diag(np.diag(poses)) - (mixed @ inverse @ mixed.T).toarray()
+                step = np.linalg.solve(reduced, pull - mixed @ (inverse @ push))
+                moved = inverse @ (push - mixed.T @ step)
+                step = step.reshape(count, 6)
+                turned = matrix_from_quaternion(quaternion_from_rotation_vector(step[:, 3:])) @ turn
+                tried = at + step[:, :3], turned, points + moved.reshape(-1, 3)
+                if (cost := bundle.cost(*tried)) < now:
+                    break
+                damping *= 10
+            else:
+                break
+            (at, turn, points), now, damping = tried, cost, max(damping / 10, 1e-9)
+            if np.abs(step[:, 3:]).max() < CONVERGED_RAD:
+                break
+    poses, _, own, _, mixed = bundle.equations(at, turn, points)
+    covariance = np.linalg.inv(poses - (mixed @ _inverse_blocks(own) @ mixed.T).toarray())
+    error = np.linalg.norm(bundle.residuals(at, turn, points)[0], axis=1)
+    apart = bundle.logged - bundle.between @ at
+    far_share = float((error > FAR_PX).mean())
+    return _AdjustedMap(
+        at, quaternion_from_matrix(turn), covariance, apart, float(np.median(error)), far_share
+    )
+
+
+def _triangulated(found: PictureMap, at: Float, turn: Float) -> Float:
+    """Return the points [P, 3] nearest to the rays that see them."""
+    ray = np.einsum("nij,nj->ni", turn[found.seen_in], np.insert(found.seen_xy, 2, 1.0, axis=1))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None]
+    points = int(found.seen_point.max()) + 1
+    normal, right = np.tile(MIN_SQUARED_ANGLE * np.eye(3), (points, 1, 1)), np.zeros((points, 3))
+    middle = at.mean(axis=0)
+    np.add.at(normal, found.seen_point, across)
+    np.add.at(right, found.seen_point, np.einsum("nij,nj->ni", across, at[found.seen_in] - middle))
+    return np.asarray(middle + np.linalg.solve(normal, right[:, :, None])[:, :, 0])
+
+
+def _inverse_blocks(blocks: Float) -> Any:
+    """Return the sparse block-diagonal matrix of the inverses of blocks [P, 3, 3]."""
+    from scipy.sparse import bsr_matrix
+
+    count = len(blocks)
+    regular = blocks + MIN_POINT_PRECISION * np.eye(3)
+    return bsr_matrix(
+        (np.linalg.inv(regular), np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count)
+    )
 
 
 def _bridge_sigma(at_ns: Int64, quaternion_xyzw: Float) -> float:

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from pipelines.geometry.arrays import Int64, Intrinsics
+from pipelines.geometry.arrays import Index, Intrinsics
 from pipelines.geometry.noise import PoseErrors, pose_errors
+from pipelines.reconstruction.background_tracks import Follower
 from pipelines.reconstruction.picture_map import (
     REVISION,
     KeyFeatures,
@@ -18,10 +19,14 @@ from pipelines.reconstruction.picture_map import (
     NoAttitudesError,
     PictureMap,
     features_of,
+    followed_features,
+    is_film,
     key_rows,
     lay_on_places,
     map_pictures,
     poses_of_pictures,
+    rows_of_film,
+    shrunk,
     with_focal,
 )
 from pipelines.session.camera_poses import noise_models
@@ -38,6 +43,14 @@ PICTURE_MAP = pa.schema(
     [("key", pa.int64()), *((name, pa.float64()) for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))]
 )
 """cameras/<camera>/picture_map.parquet: map_from_camera of the mapped key pictures."""
+
+PICTURE_MAP_SIGHTINGS = pa.schema(
+    [("key", pa.int64()), ("point", pa.int64()), ("x", pa.float64()), ("y", pa.float64())]
+)
+"""cameras/<camera>/picture_map_sightings.parquet: the map's points in these pictures, x/z and y/z."""
+
+MAP_FILES = ("picture_map.parquet", "picture_map_sightings.parquet")
+"""Files of a map in a camera's folder."""
 
 # A satellite receiver's error decorrelates in minutes (docs/flight.md, Poses).
 SATELLITE_CORRELATION_S = 100.0
@@ -114,10 +127,11 @@ def turned_by_pictures(
     try:
         found = kept(key)
         if found is None:
-            progress.start(f"Mapping {name} by its pictures", len(numbers))
-            features = _features(film, numbers, intrinsics, progress)
+            features = _features(film, frames, rows, intrinsics, progress)
             found = map_pictures(features, intrinsics, refine_focal=refine_focal)
-        laid = lay_on_places(found, frames.t_ns[rows], places.t_ns, places.position, _errors(place, stated))
+        laid = lay_on_places(
+            found, intrinsics, frames.t_ns[rows], places.t_ns, places.position, _errors(place, stated)
+        )
     except NoAttitudesError as error:
         problem = f"its film does not say how it turned: {error}"
         remedy = "name a log with attitudes, or gimbal: {yaw_deg: 90, pitch_deg: -30} if it never turned"
@@ -129,8 +143,8 @@ def turned_by_pictures(
         key=key,
         key_pictures=len(numbers),
         mapped=len(found.key),
-        points=found.points,
-        error_px=found.error_px,
+        points=int(found.seen_point.max()) + 1,
+        error_px=laid.error_px,
         residual_m=laid.residual_m,
         common_sigma_deg=common_deg,
         picture_sigma_deg=picture_deg,
@@ -161,16 +175,24 @@ def turned_by_pictures(
 
 
 def _features(
-    film: FilmOfCamera, numbers: list[int], intrinsics: Intrinsics, progress: Progress
+    film: FilmOfCamera, frames: CameraFrames, keys: Index, intrinsics: Intrinsics, progress: Progress
 ) -> list[KeyFeatures]:
-    features = []
+    followed = rows_of_film(frames.pts_ns, keys) if is_film(frames.pts_ns) else None
+    rows = keys if followed is None else followed
+    follower, features = Follower(), []
+    progress.start("Mapping by pictures", len(rows))
     with film.opened() as pictures:
-        for number in numbers:
+        for k, number in enumerate(frames.frame[rows].tolist()):
             picture = pictures.read(number)
-            blank = np.zeros((intrinsics.height, intrinsics.width), np.uint8)
-            features.append(features_of(blank if picture is None else picture, intrinsics))
+            if followed is not None:
+                follower.step(k, None if picture is None else shrunk(picture))
+            else:
+                blank = np.zeros((intrinsics.height, intrinsics.width), np.uint8)
+                features.append(features_of(blank if picture is None else picture, intrinsics))
             progress.advance()
-    return features
+    if followed is None:
+        return features
+    return followed_features(follower.tracks(), followed, keys, intrinsics, frames.pts_ns)
 
 
 def _errors(place: str, stated: Mapping[str, Mapping[str, float | str]] | None) -> PoseErrors | None:
@@ -205,12 +227,19 @@ def store_map(found: PictureMap, folder: Path) -> None:
     columns = {"key": found.key}
     columns |= dict(zip(PICTURE_MAP.names[1:4], found.position.T, strict=True))
     columns |= dict(zip(PICTURE_MAP.names[4:], found.quaternion_xyzw.T, strict=True))
-    write_table(folder / "picture_map.parquet", pd.DataFrame(columns), PICTURE_MAP)
+    write_table(folder / MAP_FILES[0], pd.DataFrame(columns), PICTURE_MAP)
+    x, y = found.seen_xy.T
+    sightings = {"key": found.seen_in, "point": found.seen_point, "x": x, "y": y}
+    write_table(folder / MAP_FILES[1], pd.DataFrame(sightings), PICTURE_MAP_SIGHTINGS)
 
 
 def load_map(folder: Path, entry: PictureMapEntry) -> PictureMap:
     """Read a picture map; DataError if it is damaged."""
-    table = read_table(folder / "picture_map.parquet", PICTURE_MAP)
-    key: Int64 = table["key"].to_numpy(np.int64)
-    numbers = table[PICTURE_MAP.names[1:]].to_numpy(np.float64)
-    return PictureMap(key, numbers[:, :3], numbers[:, 3:], entry.points, entry.error_px, entry.focal_ratio)
+    poses = read_table(folder / MAP_FILES[0], PICTURE_MAP)
+    seen = read_table(folder / MAP_FILES[1], PICTURE_MAP_SIGHTINGS)
+    numbers = poses[PICTURE_MAP.names[1:]].to_numpy(np.float64)
+    key, seen_in, seen_point = (
+        column.to_numpy(np.int64) for column in (poses["key"], seen["key"], seen["point"])
+    )
+    seen_xy = seen[["x", "y"]].to_numpy(np.float64)
+    return PictureMap(key, numbers[:, :3], numbers[:, 3:], seen_in, seen_point, seen_xy, entry.focal_ratio)

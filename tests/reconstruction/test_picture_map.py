@@ -19,12 +19,14 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
     transform,
 )
+from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.reconstruction.picture_map import (
     MAX_BRIDGE_S,
     KeyFeatures,
     LaidMap,
     NoAttitudesError,
     PictureMap,
+    followed_features,
     lay_on_places,
     map_pictures,
     poses_of_pictures,
@@ -34,6 +36,7 @@ LENS = Intrinsics(1280, 720, 1000.0, 1000.0, 639.5, 359.5)
 STEP_NS = 200_000_000
 KEYS = 24
 T_NS: Int64 = np.arange(KEYS, dtype=np.int64) * STEP_NS
+NAMELESS: Int64 = np.empty(0, np.int64)
 CENTIMETRE = pose_errors([White(position_m=0.01)])
 
 
@@ -50,10 +53,30 @@ def flown(*, straight: bool = False, along_view: bool = False) -> tuple[Float, F
 
 
 def mapped(places: Float, turned: Float) -> PictureMap:
-    """Return an exact map in another frame and scale."""
+    """Return an exact map in another frame and scale, with 40 points before each of four cameras."""
     turn = quaternion_from_rotation_vector(np.array([0.4, -1.0, 0.7]))
     position = 0.3 * rotate(turn, places - [5.0, 1.0, 2.0])
-    return PictureMap(np.arange(len(places)), position, multiply(turn, turned), points=900, error_px=0.5)
+    ahead = np.random.default_rng(8).uniform([-5, -3, 8], [5, 3, 20], (4, 40, 3))
+    some = range(0, len(places), len(places) // 4 + 1)
+    world = np.concatenate(
+        [transform((places[k], turned[k]), near) for k, near in zip(some, ahead, strict=True)]
+    )
+    seen_in, seen_point, seen_xy = [], [], []
+    for picture, pose in enumerate(zip(places, turned, strict=True)):
+        seen = transform(invert(*pose), world)
+        xy = seen[:, :2] / seen[:, 2:]
+        point = np.flatnonzero((seen[:, 2] > 1) & (np.abs(xy) < 0.7).all(axis=1))
+        seen_in.append(np.full(len(point), picture))
+        seen_point.append(point)
+        seen_xy.append(xy[point])
+    names = np.unique(np.concatenate(seen_point), return_inverse=True)[1]
+    sightings = np.concatenate(seen_in), names, np.concatenate(seen_xy)
+    return PictureMap(np.arange(len(places)), position, multiply(turn, turned), *sightings)
+
+
+def laid_on(found: PictureMap, places: Float, errors: PoseErrors | None, *, keys_ns: Int64 = T_NS) -> LaidMap:
+    """Lay a map on a place at each key picture."""
+    return lay_on_places(found, LENS, keys_ns, T_NS, places, errors)
 
 
 def errors_deg(laid: LaidMap, turned: Float) -> Float:
@@ -62,10 +85,10 @@ def errors_deg(laid: LaidMap, turned: Float) -> Float:
 
 
 def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m: float) -> list[KeyFeatures]:
-    """Return features of 500 points up to a height, with errors of 0.3 px; `lens` is what is known of it."""
+    """Return features of 300 points up to a height, with errors of 0.3 px; `lens` is what is known of it."""
     rng = np.random.default_rng(7)
-    world = rng.uniform([-6, -6, 0], [6, 6, height_m], (500, 3))
-    descriptors = rng.gamma(0.5, 40, (500, 128))
+    world = rng.uniform([-6, -6, 0], [6, 6, height_m], (300, 3))
+    descriptors = rng.gamma(0.5, 40, (300, 128))
     features = []
     for pose in zip(places, turned, strict=True):
         pixels = project(transform(invert(*pose), world), LENS)
@@ -73,7 +96,7 @@ def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m:
         noisy = descriptors[seen] + rng.normal(0, 4, (int(seen.sum()), 128))
         pixels = pixels[seen] + rng.normal(0, 0.3, (int(seen.sum()), 2))
         xy = (pixels - [lens.cx, lens.cy]) / lens.fx
-        features.append(KeyFeatures(xy, noisy.clip(0, 255).astype(np.uint8)))
+        features.append(KeyFeatures(xy, noisy.clip(0, 255).astype(np.uint8), NAMELESS))
     return features
 
 
@@ -83,7 +106,7 @@ def test_features_of_points_give_the_map() -> None:
     features = features_of_points(places, turned, LENS, 5.0)
     found = map_pictures(features, LENS)
     assert found.key.tolist() == list(range(KEYS))
-    laid = lay_on_places(found, T_NS, T_NS, places, CENTIMETRE)
+    laid = laid_on(found, places, CENTIMETRE)
     assert np.abs(errors_deg(laid, turned)).max() < 0.1
     assert np.linalg.norm(laid.position - places, axis=1).max() < 0.02
 
@@ -93,7 +116,26 @@ def test_features_of_points_give_the_map() -> None:
     with pytest.raises(NoAttitudesError):  # a camera that stands sees everything at the same place
         map_pictures([features[0]] * 12, LENS)
     with pytest.raises(NoAttitudesError):  # pictures without texture
-        map_pictures([KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8))] * 12, LENS)
+        map_pictures([KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8), NAMELESS)] * 12, LENS)
+
+
+def test_followed_points_give_the_map() -> None:
+    """Points are exact to 0.3 px."""
+    places, turned = flown()
+    world = np.random.default_rng(7).uniform([-6, -6, 0], [6, 6, 5], (300, 3))
+    rng, picture, point, xy = np.random.default_rng(1), [], [], []
+    for k, pose in enumerate(zip(places, turned, strict=True)):
+        pixels = project(transform(invert(*pose), world), LENS)
+        seen = np.flatnonzero((pixels > 0).all(axis=1) & (pixels < [1279, 719]).all(axis=1))
+        picture.append(np.full(len(seen), k))
+        point.append(seen)
+        xy.append(pixels[seen] + rng.normal(0, 0.3, (len(seen), 2)))
+    tracks = Tracks(np.concatenate(picture), np.concatenate(point), np.concatenate(xy))
+    rows = np.arange(KEYS)
+    found = map_pictures(followed_features(tracks, rows, rows, LENS, T_NS), LENS)
+    laid = laid_on(found, places, CENTIMETRE)
+    assert found.key.tolist() == rows.tolist()
+    assert np.abs(errors_deg(laid, turned)).max() < 0.1
 
 
 def test_a_guessed_focal_length_is_refined_where_pictures_determine_it() -> None:
@@ -111,13 +153,13 @@ def test_a_guessed_focal_length_is_refined_where_pictures_determine_it() -> None
 
 
 def test_attitudes_are_off_by_what_is_said_of_them() -> None:
-    """White errors of 0.1 m on a curve of some metres: 40 draws have the predicted mean square, 3 axes."""
+    """White errors of 0.1 m on a curve of some metres: 20 draws have the predicted mean square, 3 axes."""
     places, turned = flown()
     found, rng = mapped(places, turned), np.random.default_rng(3)
     ratios = []
-    for _ in range(40):
+    for _ in range(20):
         noisy = places + rng.normal(0, 0.1, places.shape)
-        laid = lay_on_places(found, T_NS, T_NS, noisy, pose_errors([White(position_m=0.1)]))
+        laid = laid_on(found, noisy, pose_errors([White(position_m=0.1)]))
         common = np.radians(errors_deg(laid, turned).mean(axis=0))
         ratios.append(float(np.square(common).sum()) / (3 * laid.common_sigma_rad**2))
     assert 0.6 < np.mean(ratios) < 1.6
@@ -127,20 +169,29 @@ def test_a_place_that_jumps_away_is_left_out() -> None:
     places, turned = flown()
     jumped = places + np.random.default_rng(1).normal(0, 0.01, places.shape)
     jumped[5] += [30.0, -20.0, 4.0]
-    laid = lay_on_places(mapped(places, turned), T_NS, T_NS, jumped, CENTIMETRE)
+    laid = laid_on(mapped(places, turned), jumped, CENTIMETRE)
     assert np.abs(errors_deg(laid, turned)).max() < 0.3
 
 
 def test_the_horizon_levels_a_straight_flight_along_the_view() -> None:
     """Places on a line do not say how the map turns about it; pictures without roll do, to 2 deg."""
     places, turned = flown(along_view=True)
-    laid = lay_on_places(mapped(places, turned), T_NS, T_NS, places, CENTIMETRE)
+    laid = laid_on(mapped(places, turned), places, CENTIMETRE)
     assert np.abs(errors_deg(laid, turned)).max() < 0.05
     assert 1.0 < np.degrees(laid.common_sigma_rad) < 2.0
 
 
+def test_a_bent_map_is_straightened_by_the_places() -> None:
+    places, turned = flown()
+    found = mapped(places, turned)
+    middle = found.position - found.position.mean(axis=0)
+    bent = replace(found, position=found.position + 0.2 * found.size * np.sin(3 * middle / found.size))
+    laid = laid_on(bent, places, CENTIMETRE)
+    assert np.abs(errors_deg(laid, turned)).max() < 0.1
+
+
 @pytest.mark.parametrize(
-    "what", ["straight, seen from the side", "smaller than its noise", "another path", "a bent map"]
+    "what", ["straight, seen from the side", "smaller than its noise", "another path", "other points"]
 )
 def test_places_that_do_not_say_how_the_map_lies_are_refused(what: str) -> None:
     places, turned = flown(straight=what.startswith("straight"))
@@ -150,22 +201,30 @@ def test_places_that_do_not_say_how_the_map_lies_are_refused(what: str) -> None:
     if what == "another path":
         walk = np.random.default_rng(2).normal(0, 1, places.shape).cumsum(axis=0)
         places = walk - walk[0]
-    if what == "a bent map":
-        middle = found.position - found.position.mean(axis=0)
-        found = replace(found, position=found.position + 0.3 * found.size * np.sin(3 * middle / found.size))
-    for known in (errors, None) if what == "a bent map" else (errors,):
-        with pytest.raises(NoAttitudesError):
-            lay_on_places(found, T_NS, T_NS, places, known)
+    if what == "other points":  # a third of the sightings is of points elsewhere
+        some = np.arange(0, len(found.seen_xy), 3)
+        xy = found.seen_xy.copy()
+        xy[some] = np.random.default_rng(3).uniform(-0.5, 0.5, (len(some), 2))
+        found = replace(found, seen_xy=xy)
+    with pytest.raises(NoAttitudesError):
+        laid_on(found, places, errors)
 
 
 def test_pictures_between_keys_get_poses_but_not_across_a_gap() -> None:
     places, turned = flown()
     whole = mapped(places, turned)
     kept = np.r_[0:8, 16:KEYS]  # a gap of 1.8 s
+    seen = np.isin(whole.seen_in, kept)
     found = replace(
-        whole, key=kept, position=whole.position[kept], quaternion_xyzw=whole.quaternion_xyzw[kept]
+        whole,
+        key=kept,
+        position=whole.position[kept],
+        quaternion_xyzw=whole.quaternion_xyzw[kept],
+        seen_in=np.searchsorted(kept, whole.seen_in[seen]),
+        seen_point=whole.seen_point[seen],
+        seen_xy=whole.seen_xy[seen],
     )
-    laid = lay_on_places(found, T_NS, T_NS, places, None)
+    laid = laid_on(found, places, None)
     at_ns = np.arange(0, int(T_NS[-1]) + 1, STEP_NS // 4)
     position, quaternion = poses_of_pictures(laid, T_NS, places, at_ns)
     known = np.isfinite(quaternion[:, 0])
@@ -185,7 +244,6 @@ def test_unstated_errors_of_places_are_those_of_the_fit() -> None:
     places, turned = flown()
     noisy = places + np.random.default_rng(4).normal(0, 0.05, places.shape)
     stated, unstated = (
-        lay_on_places(mapped(places, turned), T_NS, T_NS, noisy, errors)
-        for errors in (PoseErrors((0.05, 0.0), ()), None)
+        laid_on(mapped(places, turned), noisy, errors) for errors in (PoseErrors((0.05, 0.0), ()), None)
     )
     assert unstated.common_sigma_rad == pytest.approx(stated.common_sigma_rad, rel=0.4)
