@@ -280,6 +280,7 @@ def map_pictures(
             place / "features.db", verifier_options=one, two_view_geometry_options=verifying
         )
         options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=SEED)
+        options.mapper.num_threads = options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
         options.mapper.bundle_adjustment.refine_focal_length = refine_focal
         options.mapper.bundle_adjustment.refine_extra_params = False
         (place / "maps").mkdir()
