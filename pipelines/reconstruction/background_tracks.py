@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -129,8 +130,6 @@ def load_stills(session: Path, camera: Camera) -> Stills | None:
 
 
 def _decoded(path: Path) -> Bytes:
-    import cv2
-
     picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise DataError(path, "cannot be decoded", "run `mocap reconstruct --force`", code="damaged")
@@ -187,8 +186,6 @@ class Follower:
             row: number of the picture in the tracks.
             picture: grey [H, W]; None if it cannot be decoded. No point is followed across it.
         """
-        import cv2
-
         if picture is None or self._before is None:
             self._points, self._number = self._points[:0], self._number[:0]
         elif len(self._points):
@@ -238,8 +235,6 @@ def follow(pictures: Iterable[Bytes | None]) -> Tracks:
 
 def _flow(before: Bytes, after: Bytes, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Find points [N, 1, 2] of one picture in the other; also return found [N, 1], 0 or 1."""
-    import cv2
-
     window = (_WINDOW_PX, _WINDOW_PX)
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, np.empty_like(points), winSize=window, maxLevel=_LEVELS

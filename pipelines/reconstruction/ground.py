@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64, Picture
@@ -273,8 +274,6 @@ def _view(
 
 def _pyramid(picture: Picture) -> dict[int, Picture]:
     """Halve a picture several times: levels by how often. A large picture's own level is left out."""
-    import cv2
-
     levels = {0: picture}
     for level in range(_LEVELS):
         levels[level + 1] = np.asarray(cv2.pyrDown(levels[level]), dtype=np.uint8)
@@ -515,8 +514,6 @@ class _Cuts:
 
     def orthophoto(self, k: int, xy: Float, cells: Int64) -> Picture:
         """Cut `cells` [2] out of the k-th still, whose corners are at pixels [4, 2] inside it."""
-        import cv2
-
         pyramid = self.view.stills[self.still[k]]
         sides_px = np.abs(xy - np.roll(xy, 1, axis=0)).max(axis=1)
         span_px = float((sides_px / cells[[1, 0, 1, 0]]).max())
@@ -572,8 +569,6 @@ def _displacements(a: _Cuts, b: _Cuts, places: _Places, expected: Float, reach_m
 
 def _peak(searched: Picture, wanted: Picture) -> Float | None:
     """Find where a picture shows another one: first cell [2], right and down; None if not clear."""
-    import cv2
-
     alike = cv2.matchTemplate(searched, wanted, cv2.TM_CCOEFF_NORMED)
     y, x = np.unravel_index(int(alike.argmax()), alike.shape)
     if not (0 < x < alike.shape[1] - 1 and 0 < y < alike.shape[0] - 1) or alike[y, x] < _ALIKE:

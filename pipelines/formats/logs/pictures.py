@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from pipelines.formats.logs.messages import all_samples
@@ -117,8 +118,6 @@ def is_known(sample: PictureSample) -> bool:
 
 def decode(sample: PictureSample) -> Picture | None:
     """Decode a logged picture to BGR [H, W, 3]; None if its bytes are damaged or its encoding is unknown."""
-    import cv2
-
     try:
         decoded = _compressed(sample) if sample.width is None or sample.height is None else _raw(sample)
     except cv2.error:
@@ -127,8 +126,6 @@ def decode(sample: PictureSample) -> Picture | None:
 
 
 def _compressed(sample: PictureSample) -> Picture | None:
-    import cv2
-
     if not len(sample.data):
         return None
     decoded = cv2.imdecode(np.asarray(sample.data, np.uint8), cv2.IMREAD_COLOR)
@@ -136,8 +133,6 @@ def _compressed(sample: PictureSample) -> Picture | None:
 
 
 def _raw(sample: PictureSample) -> Picture | None:
-    import cv2
-
     width, height = sample.width or 0, sample.height or 0
     if not is_known(sample):
         return None

@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from pipelines.geometry.arrays import Int64, Picture
@@ -81,7 +82,6 @@ class H264Stream:
     def encode(self, picture: Picture) -> tuple[bytes, bool]:
         """Encode a picture [height, width, 3] BGR; return its access unit, and if it is a key frame."""
         import av
-        import cv2
 
         if self._codec is None:
             self._codec = _open_stream(picture.shape[1], picture.shape[0])
@@ -190,8 +190,6 @@ def _angle_named(words: str) -> str:
 
 def _write_video(path: Path, t_ns: Int64, pictures: Iterator[Picture]) -> None:
     """Write pictures of any size in the even size of the first, with their times since the first."""
-    import cv2
-
     first = next(pictures)
     height, width = (side + side % 2 for side in first.shape[:2])
 
