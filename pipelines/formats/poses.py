@@ -183,10 +183,11 @@ def _is_tum(head: str) -> bool:
 
 def _read_tum(path: Path) -> Trajectory:
     """Read every pose in the order of columns that the header states, else in TUM's."""
-    body, columns, unit = _take_header(_spaced(read_text(path)))
-    width = len(_TUM)
-    if _is_vins_mono(body.partition("\n")[0]):
-        columns, unit, width = _VINS, NANOSECONDS, 11
+    text = read_text(path)
+    body, columns, unit = _take_header(_spaced(text))
+    first, width = body.partition("\n")[0], len(_TUM)
+    if _is_vins_mono(first, text.partition("\n")[0]):
+        columns, unit, width = _VINS, NANOSECONDS, len(_numbers_of(first))
     elif path.name == "vio_loop.csv" and columns == _TUM:
         columns = _VINS
     numbers = {name: index for index, name in enumerate(columns) if index}
@@ -231,10 +232,16 @@ def _quaternion_in(headings: list[str]) -> tuple[str, ...] | None:
     return next((window for window in windows if sorted(window) == sorted(QUATERNION)), None)
 
 
-def _is_vins_mono(line: str) -> bool:
-    """Test for eleven numbers of VINS-Mono: nanoseconds, position, quaternion with w first, velocity."""
+def _is_vins_mono(line: str, written: str = "") -> bool:
+    """Test for VINS-Mono: nanoseconds, position, quaternion with w first, and velocity or a comma at the end.
+
+    Args:
+        line: the first line of numbers, with single spaces between them.
+        written: the line as it stands in the file.
+    """
     numbers = _numbers_of(line)
-    return len(numbers) == 11 and numbers[0] > 1e17 and abs(math.hypot(*numbers[4:8]) - 1) < 1e-2
+    length = 8 if written.rstrip().endswith(",") and len(numbers) == 8 else 11
+    return len(numbers) == length and numbers[0] > 1e17 and abs(math.hypot(*numbers[4:8]) - 1) < 1e-2
 
 
 TUM = TrajectoryFile("tum", "TUM trajectory", (".tum", ".txt", ".csv", ".log"), _is_tum, _read_tum)

@@ -147,13 +147,15 @@ def test_cameras_and_joints_as_evo_reads_them(tmp_path: Path, monkeypatch: pytes
 
 
 def test_vins_writes_w_first(tmp_path: Path) -> None:
-    """VINS-Fusion's vio_loop.csv by its name, VINS-Mono's rows by their eleven numbers in nanoseconds."""
+    """VINS-Fusion's vio_loop.csv by its name, VINS-Mono's rows by their nanoseconds and last comma."""
     turned = [0.5, 0.1, 0.7, 0.5]  # w x y z
     numbers = " ".join(map(str, [1.5, -2.0, 3.0, *turned]))
     (tmp_path / "vio_loop.csv").write_text(f"1700000000.25 {numbers}\n1700000001.25 {numbers}\n")
     mono = f"1700000000250000000,{numbers.replace(' ', ',')},0.1,0.2,0.3,\n"
-    (tmp_path / "vins.csv").write_text(mono + mono.replace("000250", "001250"))
-    for name in ("vio_loop.csv", "vins.csv"):
+    both = mono + mono.replace("000250", "001250")
+    (tmp_path / "vins.csv").write_text(both)
+    (tmp_path / "vins_result_loop.csv").write_text(both.replace("0.1,0.2,0.3,", ""))
+    for name in ("vio_loop.csv", "vins.csv", "vins_result_loop.csv"):
         assert READER.recognises(tmp_path / name)
         found = READER.read_trajectory(tmp_path / name)
         assert found.t_ns.tolist() == [1_700_000_000_250_000_000, 1_700_000_001_250_000_000]
