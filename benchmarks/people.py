@@ -8,8 +8,7 @@ films the scenes instead (rendered, 640x360 px, among trees): the real detector 
 
 Seen: times at which two cameras or more see at least half of the joints of a true person. Coverage is the
 share of these at which somebody reconstructed is within 0.5 m of them. Detected is the share of these at
-which two cameras or more have a detection of the person: the median over its joints is within 0.25 m of the
-true ones, at the person's distance, and nobody else is nearer. All else is that of metrics.json.
+which two cameras or more have a detection of the person (`detections_of`). All else is of metrics.json.
 """
 
 import argparse

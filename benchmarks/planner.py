@@ -5,17 +5,14 @@
     python -m benchmarks.planner filming              # published plans, needs MOCAP_REAL_DATA
     python -m benchmarks.planner groups [--seeds 10 11 12 13 14 15]     # people who walk apart and come back
 
-Every command takes `--write`. Worlds have walls down to one voxel, boxes, forests, hills and overhangs.
-Flights are checked against the analytic surfaces that the voxels were made from. Worlds 1000 to 1999 were
-tuned on; those from 2000 on are kept aside.
+Worlds have walls down to one voxel, boxes, forests, hills and overhangs; flights are checked against their
+analytic surfaces. Worlds 1000 to 1999 were tuned on; those from 2000 on are kept aside.
 
-prediction: one posture of a walk, carried along by the actor, is measured by triangulation with modelled
-keypoints and white pose noise (0.02 m, 0.2 deg). The ray model predicts the error from the same noise.
-
-filming: the scenes of Hughes et al. 2024, four robots that jump from cell to cell of a grid of 1 m, 4 to 6
-people who move. Their planners' solutions are scored with `view_quality`, frame by frame, and so are plans of
-the arm `group` from the same starts, under the same limits. groups: `first` is `adaptive` with the weight of
-all others 0.
+prediction: one posture of a walk is measured by triangulation with modelled keypoints and white pose noise,
+and the ray model predicts the error. filming: the scenes of Hughes et al. 2024, four robots that jump from
+cell to cell of a grid of 1 m, 4 to 6 people who move. Their planners' solutions are scored with
+`view_quality`, and so are plans of the arm `group` from the same starts, under the same limits. groups:
+`first` is `adaptive` with the weight of all others 0.
 """
 
 import argparse

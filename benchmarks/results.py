@@ -5,8 +5,7 @@
     python -m benchmarks.results --page      # write the page alone
     python -m benchmarks.results --check     # exit 1 if the page is not what docs/results.json gives
 
-Each part of the page is a table with the command that measured it, its date and commit. The other commands of
-`benchmarks` replace their parts with `--write`. The detector must be there (`mocap models fetch blazepose`).
+The other commands of `benchmarks` replace their parts of the page with `--write`.
 """
 
 import argparse

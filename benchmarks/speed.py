@@ -1,8 +1,7 @@
 """Speed of all that takes time, beside peers: `python -m benchmarks.speed [--only NAME ...] [--write]`.
 
-Times are those of one thread with compiled code warm: the best of several runs, in processor time unless a
-row says otherwise. Peers run here, but for those of `refined`, which were measured once for this project on
-another machine (2,250 frames of the same kind of walk, five cameras, true poses).
+Times are those of one thread with compiled code warm: the best of several runs, in processor time. Peers run
+here, but for those of `refined`, which were measured once on another machine.
 
     triangulation  22,500 frames of 17 joints in five cameras, 2 px; also 5 % gross errors and missing views
     association    five people among each other in five cameras, 450 frames
