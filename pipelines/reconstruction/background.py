@@ -30,8 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
-from pipelines.geometry.cameras import row_delay_s, undistort
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import (
     EXACT,
     ROTATION,
@@ -49,7 +48,6 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
-    velocities,
 )
 from pipelines.reconstruction.background_kernels import (
     BackgroundPoints,
@@ -60,7 +58,7 @@ from pipelines.reconstruction.background_kernels import (
     inverse_in_band,
     move_points,
 )
-from pipelines.reconstruction.background_tracks import Followed, Tracks
+from pipelines.reconstruction.background_tracks import Followed, rays_at_stamps
 from pipelines.reconstruction.doubts.turning import common_offset
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
@@ -1031,27 +1029,6 @@ def background_of(camera: Camera, followed: Followed) -> Background:
 
     loosened = None if camera.loosened is None else camera.loosened_at(t_ns)
     return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened)
-
-
-def rays_at_stamps(tracks: Tracks, intrinsics: Intrinsics, t_ns: Int64) -> Float:
-    """Compute the viewing rays [K, 2] of followed points at the stamps [T] of their pictures.
-
-    Points of a rolling shutter go on from their rows' times by their own velocities.
-    """
-    rays = undistort(tracks.xy, intrinsics)
-    if not intrinsics.readout_s:
-        return rays
-    delay_s = row_delay_s(tracks.xy[:, 1], intrinsics)
-    order = np.lexsort((tracks.picture, tracks.point))
-    point, picture = tracks.point[order], tracks.picture[order]
-    follows = (np.diff(point) == 0) & (np.diff(picture) == 1)
-    t_s = (t_ns[picture] - t_ns[0]) / 1e9 + delay_s[order]
-    before, after = velocities(t_s, rays[order], follows)
-    sides = np.stack([np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)])
-    motion = np.empty_like(rays)
-    motion[order] = sides.mean(axis=0) * delay_s[order, None]
-    # A point that was seen once has no velocity, and is used for nothing.
-    return rays - np.nan_to_num(motion)
 
 
 def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:

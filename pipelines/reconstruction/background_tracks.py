@@ -16,7 +16,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bytes, Float, Int64
+from pipelines.geometry.arrays import Bytes, Float, Int64, Intrinsics
+from pipelines.geometry.cameras import row_delay_s, undistort
+from pipelines.geometry.poses import velocities
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.errors import DataError
 from pipelines.session.tables import TRACKS, table_parts
@@ -40,6 +42,27 @@ class Tracks:
     picture: Int64  # [K] row of the pictures
     point: Int64  # [K] number of the point
     xy: Float  # [K, 2] px
+
+
+def rays_at_stamps(tracks: Tracks, intrinsics: Intrinsics, t_ns: Int64) -> Float:
+    """Compute the viewing rays [K, 2] of followed points at the stamps [T] of their pictures.
+
+    Points of a rolling shutter go on from their rows' times by their own velocities.
+    """
+    rays = undistort(tracks.xy, intrinsics)
+    if not intrinsics.readout_s:
+        return rays
+    delay_s = row_delay_s(tracks.xy[:, 1], intrinsics)
+    order = np.lexsort((tracks.picture, tracks.point))
+    point, picture = tracks.point[order], tracks.picture[order]
+    follows = (np.diff(point) == 0) & (np.diff(picture) == 1)
+    t_s = (t_ns[picture] - t_ns[0]) / 1e9 + delay_s[order]
+    before, after = velocities(t_s, rays[order], follows)
+    sides = np.stack([np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)])
+    motion = np.empty_like(rays)
+    motion[order] = sides.mean(axis=0) * delay_s[order, None]
+    # A point that was seen once has no velocity, and is used for nothing.
+    return rays - np.nan_to_num(motion)
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotate,
 )
-from pipelines.reconstruction.background import rays_at_stamps
-from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.reconstruction.background_tracks import Tracks, rays_at_stamps
 
 # Another number of features, pairs or key pictures gives other maps: kept maps of an older one are not used.
 REVISION = 2

@@ -92,7 +92,7 @@ def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m:
     features = []
     for pose in zip(places, turned, strict=True):
         pixels = project(transform(invert(*pose), world), LENS)
-        seen = (pixels > 0).all(axis=1) & (pixels < [1279, 719]).all(axis=1) & (rng.random(500) < 0.7)
+        seen = (pixels > 0).all(axis=1) & (pixels < [1279, 719]).all(axis=1) & (rng.random(300) < 0.7)
         noisy = descriptors[seen] + rng.normal(0, 4, (int(seen.sum()), 128))
         pixels = pixels[seen] + rng.normal(0, 0.3, (int(seen.sum()), 2))
         xy = (pixels - [lens.cx, lens.cy]) / lens.fx
