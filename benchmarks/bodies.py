@@ -2,9 +2,8 @@
 
 The flights are those of `corpus`, first draw, with the true noise model given. Shape and rotations of the
 people are known. Each camera is also one by itself, without a stated stature. "Landmarks" are the skeleton's
-shoulders, elbows, hips, knees and ankles against the true
-joint centres, "centres" those of the body; both relative to the middle of the hips. NEES is that of vertices,
-by the covariances in body.parquet.
+shoulders, elbows, hips, knees and ankles against the true joint centres, "centres" those of the body; both
+relative to the middle of the hips. NEES is that of vertices, by the covariances in body.parquet.
 """
 
 import argparse
