@@ -41,8 +41,8 @@ from pipelines.reconstruction.picture_map import (
 )
 from pipelines.session.records import Trajectory
 
-TUNED = ("01-walk", "02-jog", "06-turn", "07-jog", "15-two-people", "05-dance")
-KEPT = ("08-walk", "14-dance", "16-two-people", "24-two-people-dance", "18-stand")
+TUNED = ("01-walk", "02-jog", "06-turn", "07-jog", "15-two-people", "16-two-people", "05-dance")
+KEPT = ("08-walk", "14-dance", "24-two-people-dance", "18-stand")
 """Flights that no constant was chosen on. The last of each half hovers."""
 LOGS: dict[str, tuple[list[NoiseModel], float]] = {
     "rtk": ([White(position_m=0.02), Bias(position_m=0.05)], 0.1),

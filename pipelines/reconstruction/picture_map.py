@@ -99,8 +99,8 @@ LOSS_ROUNDS_PX = (30.0, 6.0, 2.0)
 SIGHTINGS_ALIKE = 64.0
 # Sightings err by this where residuals are smaller (features of photographs).
 MIN_SIGHTING_PX = 0.2
-# An adjustment of the start of a right map takes ten steps.
-MAX_STEPS = 30
+# An adjustment of the start of a right map takes ten steps, that of a bent one fifty.
+MAX_STEPS = 100
 # A tenth of the smallest standard deviation of an attitude.
 CONVERGED_RAD = 1e-4
 # Nothing that pictures show is nearer.
@@ -497,7 +497,9 @@ def lay_on_places(
         level = max(float(np.sqrt(np.square(start.places(between @ found.position) - logged).mean())), 1e-3)
         errors = PoseErrors((level, 0.0), ())
     covariance = position_covariance(errors, seconds)
-    factor = cholesky(covariance, lower=True)
+    # A map that is bent misses the places by more than their errors, whichever way up it lies.
+    bend = float(np.square(start.places(between @ found.position) - logged).mean())
+    factor = cholesky(covariance + bend * np.eye(len(covariance)), lower=True)
     start = _upright(start, between @ found.position, logged, factor, found.quaternion_xyzw)
     precision = np.asarray(np.linalg.inv(covariance), np.float64)
     focal_px = found.focal_ratio * (intrinsics.fx * intrinsics.fy) ** 0.5
@@ -723,6 +725,8 @@ def _adjusted(start: _Similarity, bundle: _Bundle) -> _AdjustedMap:
             (at, turn, points), now, damping = tried, cost, max(damping / 10, 1e-9)
             if np.abs(step[:, 3:]).max() < CONVERGED_RAD:
                 break
+        else:
+            raise NoAttitudesError("no attitudes fit its map and its places: the adjustment did not converge")
     poses, _, own, _, mixed = bundle.equations(at, turn, points)
     covariance = np.linalg.inv(poses - (mixed @ _inverse_blocks(own) @ mixed.T).toarray())
     error = np.linalg.norm(bundle.residuals(at, turn, points)[0], axis=1)
