@@ -54,6 +54,8 @@ _PRICE_OF_UNUSUAL_RATE = 1.0
 _PRICE_OF_UNFILMED = 3.0
 # A stated error is questioned beyond so many of its standard deviations: errors have heavy tails.
 _LEAST_SIGMAS = 5.0
+# A fitted number that is nearer to zero, in its own standard deviations, may be zero.
+_LEAST_OWN_SIGMAS = 3.0
 # Smaller faults do not matter beside the errors of good poses, whatever is stated of these.
 _LEAST_SHIFT_M, _LEAST_TURN_RAD, _LEAST_ZOOM = 0.2, np.radians(2.0), 0.1
 # Focal lengths are wrong by at most this logarithm: a factor of twenty.
@@ -443,7 +445,6 @@ def _conventions(trial: Trial) -> Iterator[Posed]:
     ned, below, swapped = place @ _ENU_FROM_NED.T, place * [1.0, 1.0, -1.0], place[..., [1, 0, 2]]
     on_body, own = camera @ _FLU_FROM_OPTICAL, body_back @ mounts
     table: list[tuple[str, str, str, Float, Float]] = [
-        ("axes", f"the positions count z {z}wards, the attitudes do not", upside_down, camera, below),
         ("axes", "the positions have x and y exchanged", "", camera, swapped),
         ("convention", f"the poses are {of_camera}", inverted, camera_back, camera_origin),
         ("convention", f"the poses are {of_body}", inverted, carried_by(body_back), body_origin),
@@ -452,6 +453,9 @@ def _conventions(trial: Trial) -> Iterator[Posed]:
         ("convention", "the poses are of the body, and are taken for the camera's", the_body, on_body, place),
         ("convention", "the poses are of the camera, and are taken for the body's", its_own, body, place),
     ]
+    if np.nanmedian(place[trial.moving, :, 2]) < 0:  # nobody takes off far above where they fly
+        what = f"the positions count z {z}wards, the attitudes do not"
+        table.append(("axes", what, upside_down, camera, below))
     held = [cameras[index].entry.poses for index in trial.moving]
     if any(poses.mount or poses.in_gimbal for poses in held):
         table.append(("axes", f"{in_axes} a body with {frame} axes", exchanged, turned, ned))
@@ -618,7 +622,8 @@ def _of_numbers(
     trial: Trial, kind: str, group: list[int], numbers: Float, covariance: Float
 ) -> Alternative | None:
     """State fitted numbers and their remedy; None if they are too small to matter."""
-    if not _matters(trial, kind, group, numbers):
+    sure = float(numbers @ np.linalg.pinv(covariance) @ numbers) > _LEAST_OWN_SIGMAS**2
+    if not sure or not _matters(trial, kind, group, numbers):
         return None
     cameras, whose, number = trial.cameras, trial.whose(group), float(numbers[-1])
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0

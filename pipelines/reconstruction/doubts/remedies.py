@@ -15,6 +15,7 @@ from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_mat
 from pipelines.reconstruction.doubts.scene import Filmed
 from pipelines.session.description import CameraEntry, PosesEntry
 
+# A mount is turned by nothing unless a mistake says so.
 _EYE = np.eye(3)
 # Entries of equal rotation matrices differ by less than this.
 _SAME = 1e-3
