@@ -10,6 +10,7 @@ readout both count, and everything after that may take each picture for one of a
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion, velocities
 from pipelines.session.camera_poses import poses_at
-from pipelines.session.description import Interpolation
+from pipelines.session.description import CameraEntry, Interpolation
 from pipelines.session.records import Detections, Trajectory
 
 # Keypoints are not interpolated between frames that are farther apart than this, and than usual.
@@ -378,3 +379,58 @@ def _at(camera: Camera, values: Float, t_ns: Int64) -> Float:
         t_ns,
         max_gap_ns=camera.largest_gap_ns,
     )
+
+
+# --- cameras of a diagnosis ------------------------------------------------------------------------------
+
+# Of poses whose noise nobody states, in a usual flight.
+UNSTATED = (0.3, np.radians(1.0), 0.1, np.radians(0.3), 0.1, np.radians(0.3))
+
+
+class PoseSigma(NamedTuple):
+    """Standard deviations per axis of a camera's poses, and of parts of them."""
+
+    position_m: float
+    rotation_rad: float
+    white_position_m: float  # new in every pose
+    white_rotation_rad: float
+    varying_position_m: float  # not constant in this flight; with the white part
+    varying_rotation_rad: float
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """One camera with the pixels of the person that it shows most."""
+
+    name: str
+    intrinsics: Intrinsics
+    t_ns: Int64  # [F] of its pictures
+    pixels: Float  # [F, J, 2] of the joints that are looked at; NaN where nothing was found
+    camera: Camera
+    entry: CameraEntry
+    sigma: PoseSigma
+
+    @property
+    def static(self) -> bool:
+        """True if the camera stands still."""
+        return self.camera.static
+
+    @property
+    def states_noise(self) -> bool:
+        """False if the errors of its poses are a guess: those of usual flights."""
+        return self.sigma != PoseSigma(*UNSTATED)
+
+    @property
+    def mount(self) -> Float | None:
+        """body_from_camera [3, 3] of a camera that is fixed to the body whose pose is logged, else None.
+
+        Of a camera on a gimbal, gimbal_from_camera.
+        """
+        stored = self.entry.poses.mount or self.entry.poses.in_gimbal
+        return None if stored is None else matrix_from_quaternion(np.array(stored.rotation_xyzw))
+
+    @property
+    def lever_m(self) -> Float:
+        """The camera's place [3] on the body whose pose is logged; 0 where nothing is said of it."""
+        stored = self.entry.poses.mount or self.entry.poses.in_gimbal
+        return np.zeros(3) if stored is None else np.array(stored.translation)

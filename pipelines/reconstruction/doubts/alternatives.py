@@ -24,12 +24,12 @@ from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import (
     JOINTS,
     STATURE_M,
-    Filmed,
     Sampled,
     SceneOfMoments,
     scene_of,
     trunk_direction,
 )
+from pipelines.reconstruction.observations import Filmed
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""

@@ -12,7 +12,7 @@ from ruamel.yaml.util import load_yaml_guess_indent
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import Looks, body_from_camera
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
-from pipelines.reconstruction.doubts.scene import Filmed
+from pipelines.reconstruction.observations import Filmed
 from pipelines.session.description import CameraEntry, PosesEntry
 
 # A mount is turned by nothing unless a mistake says so.

@@ -12,11 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
-from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.observations import UNSTATED, Camera, Filmed, PoseSigma
 from pipelines.session.camera_poses import stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.people import LoggedActor
@@ -40,8 +39,6 @@ MOMENTS = 60
 STEP_NS = 100_000_000
 """Between the two moments of a pair, for speeds."""
 
-# Of poses whose noise nobody states, in a usual flight.
-_UNKNOWN = (0.3, np.radians(1.0), 0.1, np.radians(0.3), 0.1, np.radians(0.3))
 _CALIBRATED = (0.003, 0.001, 0.0, 0.0, 0.0, 0.0)  # of a still camera
 # A keypoint is interpolated over at most this time between two pictures.
 _LONGEST_GAP_NS = 250_000_000
@@ -49,55 +46,6 @@ _LONGEST_GAP_NS = 250_000_000
 _CHOSEN_SHARE = 0.5
 # This share of a logged covariance is drawn anew in every pose.
 _NEW_SHARE = 0.5
-
-
-class PoseSigma(NamedTuple):
-    """Standard deviations per axis of a camera's poses, and of parts of them."""
-
-    position_m: float
-    rotation_rad: float
-    white_position_m: float  # new in every pose
-    white_rotation_rad: float
-    varying_position_m: float  # not constant in this flight; with the white part
-    varying_rotation_rad: float
-
-
-@dataclass(frozen=True)
-class Filmed:
-    """One camera with the pixels of the person that it shows most."""
-
-    name: str
-    intrinsics: Intrinsics
-    t_ns: Int64  # [F] of its pictures
-    pixels: Float  # [F, J, 2] of `JOINTS`; NaN where nothing was found
-    camera: Camera
-    entry: CameraEntry
-    sigma: PoseSigma
-
-    @property
-    def static(self) -> bool:
-        """True if the camera stands still."""
-        return self.camera.static
-
-    @property
-    def states_noise(self) -> bool:
-        """False if the errors of its poses are a guess: those of usual flights."""
-        return self.sigma != PoseSigma(*_UNKNOWN)
-
-    @property
-    def mount(self) -> Float | None:
-        """body_from_camera [3, 3] of a camera that is fixed to the body whose pose is logged, else None.
-
-        Of a camera on a gimbal, gimbal_from_camera.
-        """
-        stored = self.entry.poses.mount or self.entry.poses.in_gimbal
-        return None if stored is None else matrix_from_quaternion(np.array(stored.rotation_xyzw))
-
-    @property
-    def lever_m(self) -> Float:
-        """The camera's place [3] on the body whose pose is logged; 0 where nothing is said of it."""
-        stored = self.entry.poses.mount or self.entry.poses.in_gimbal
-        return np.zeros(3) if stored is None else np.array(stored.translation)
 
 
 @dataclass(frozen=True)
@@ -256,7 +204,7 @@ def _sigma(camera: Camera, entry: CameraEntry, pose_noise: str | None) -> PoseSi
         share = float(np.sqrt(_NEW_SHARE))
         new = (share * position, share * rotation)
         return PoseSigma(position, rotation, *new, *new)
-    return PoseSigma(*(_CALIBRATED if camera.static else _UNKNOWN))
+    return PoseSigma(*(_CALIBRATED if camera.static else UNSTATED))
 
 
 def _variances(model: NoiseModel, length_s: float) -> list[float]:
