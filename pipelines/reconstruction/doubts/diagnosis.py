@@ -60,11 +60,8 @@ SCATTERED = 0.65
 MISSED = 1.8
 """Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights."""
 
-STRAINED = 15.0
-"""Chi^2 of constant errors of poses from which numbers of one camera are tried.
-
-An angle or a factor that the rays make thirty times surer costs 7 of it, and must gain 9 more to be named.
-"""
+STRAINED = 10.0
+"""Chi^2 of constant errors of poses from which numbers of one camera are tried."""
 
 STRANGE = 5.0
 """Standard deviations from which one oddity is said, whatever the score."""
