@@ -178,12 +178,21 @@ def associate_one_camera(
             away /= actor_sigma_m**2 + _LOGGED_POINT_M**2
         near = np.nansum(_NEAR_CHI2 - np.minimum(away, _FAR_CHI2), axis=1)
         bodies.append((identity, time, near, float(trust[time].sum())))
+    reasons: list[str] = []
+    if actors is not None and bodies and not any((near > 0).any() for _, _, near, _ in bodies):
+        reasons.append("nobody is near the logged actor: taken is who is seen most")
+        actors = None
     chosen, total = np.full((len(time_s), 1, 0), -1, np.int64), 0.0
     wanted = (0 if actors is None else actors.shape[1]) if people is None else people
-    resumed = []
+    resumed: list[int] = []
+    unseen: list[int] = []
     while bodies and (chosen.shape[2] < max(wanted, 1) or people is None):
         person = chosen.shape[2]
         logged = actors is not None and person < actors.shape[1]
+        if logged and not any(body[2][person] > 0 for body in bodies):
+            chosen, resumed = np.append(chosen, np.full((len(time_s), 1, 1), -1), axis=2), [*resumed, 0]
+            unseen.append(person)
+            continue
         rank = [(body[2][person] if logged else 0.0, body[3]) for body in bodies]
         first = bodies.pop(max(range(len(rank)), key=rank.__getitem__))
         if person >= max(wanted, 1) and first[3] < total / 2:
@@ -203,7 +212,7 @@ def associate_one_camera(
     while chosen.shape[2] < max(wanted, 1):
         chosen, resumed = np.append(chosen, np.full((len(time_s), 1, 1), -1), axis=2), [*resumed, 0]
     doubts = ("",) * chosen.shape[2]
-    return _counted(chosen, seen, np.array(resumed, np.int64), {}, doubts, (), ())
+    return _counted(chosen, seen, np.array(resumed, np.int64), {}, doubts, tuple(unseen), tuple(reasons))
 
 
 def _noise_of_logs_m(seen: Bodies, logs: Float, most_m: float) -> float:

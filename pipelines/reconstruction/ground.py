@@ -224,6 +224,7 @@ def bind_positions(
             # Where nothing is known the search goes far, and few patches are found; they narrow the next one.
             matches = _compare(views, pairs, solution, most // share)
             if not len(matches.pair):
+                used = np.zeros_like(used)
                 break
             _, agree = _solve(matches, prior, of_pair)
             both = (matches.pair, matches.pair[agree])
@@ -239,7 +240,7 @@ def bind_positions(
         for _ in range(_LEVEL_ROUNDS):
             prior = _with_position_level(cameras, prior, solution)
             solution, _ = _solve(found, prior, of_pair)
-    return _bound(cameras, pairs, counts, used, prior, solution)
+    return _bound(cameras, pairs, counts, used, prior, solution, np.minimum(prior, _prior_sigma(cameras)))
 
 
 # --- clouds ----------------------------------------------------------------------------------------------
@@ -685,8 +686,9 @@ def _bound(
     used: Bool,
     prior: Float,
     solution: _Solution,
+    stated: Float,
 ) -> GroundBinding:
-    """Move the largest group of cameras that are bound to each other, and narrow their errors."""
+    """Move the largest group of cameras that are bound to each other, and narrow their `stated` errors."""
     total = len(cameras)
     group = _largest_group(total, [pair for pair, use in zip(pairs, used, strict=True) if use])
     position, turn = solution.errors[: 3 * total].reshape(-1, 3), solution.errors[3 * total :].reshape(-1, 3)
@@ -703,7 +705,7 @@ def _bound(
             # Against the group's common error it is as uncertain as both together.
             if group:
                 wider = float(np.sqrt(prior[3 * c] ** 2 + np.trace(common) / 3))
-                moved[c] = _narrowed(camera, wider, None, float(prior[3 * c]))
+                moved[c] = _narrowed(camera, wider, None, float(stated[3 * c]))
             continue
         place = slice(3 * c, 3 * c + 3)
         own = float(np.trace(solution.covariance[place, place] - common)) / 3
@@ -718,7 +720,7 @@ def _bound(
             position=log.position - position[c],
             quaternion_xyzw=multiply(log.quaternion_xyzw, quaternion_from_rotation_vector(-turn[c][None])),
         )
-        moved[c] = _narrowed(replace(camera, trajectory=trajectory), sigma, turn_sigma, float(prior[3 * c]))
+        moved[c] = _narrowed(replace(camera, trajectory=trajectory), sigma, turn_sigma, float(stated[3 * c]))
     entry = {
         "patches": [
             {
@@ -731,7 +733,7 @@ def _bound(
             for (a, b), (n, good), use in zip(pairs, counts, used, strict=True)
         ],
         "position_sigma_m": {
-            camera.name: {"before": float(prior[3 * c]), "against_the_others": left_m.get(camera.name)}
+            camera.name: {"before": float(stated[3 * c]), "against_the_others": left_m.get(camera.name)}
             for c, camera in enumerate(cameras)
         },
         "moved_m": {cameras[c].name: (-position[c]).tolist() for c in group},

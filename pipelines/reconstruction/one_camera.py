@@ -371,10 +371,9 @@ def _motion(poses: Poses, t_s: Float) -> _Motion:
     precision = _precision_of_motion().reshape(-1, 3)
     square = np.sum(precision * error**2, axis=-1, keepdims=True) / _MOTION_CAUCHY**2
     share = np.stack([1 / step[:-1], -1 / step[:-1] - 1 / step[1:], 1 / step[1:]], axis=1) / middle[:, None]
-    weight = (precision / (1 + square)).reshape(len(error), -1)
-    return _Motion(
-        float(_MOTION_CAUCHY**2 * np.log1p(square).sum()), error.reshape(len(error), -1), weight, share
-    )
+    size = (len(error), 3 * (1 + len(BONES)))  # no acceleration in fewer than three moments
+    weight = (precision / (1 + square)).reshape(size)
+    return _Motion(float(_MOTION_CAUCHY**2 * np.log1p(square).sum()), error.reshape(size), weight, share)
 
 
 class _Fit(NamedTuple):
@@ -523,9 +522,14 @@ def _first_poses(points: StandingPoints, rays: Rays, turns: Float, t_s: Float) -
     order = np.argsort(error, axis=0)[:_KEPT_HEADINGS]
     for heading in order:
         start = Poses(root[heading, np.arange(len(t_s))], turns[heading])
-        poses, cost = settle(points, start, rays, shared, _FIRST_STEPS)
-        found.append(poses)
-        costs.append(cost)
+        parts = [
+            settle(points, _poses_of(start, part), _of(rays, part), shared, _FIRST_STEPS)
+            for part in np.array_split(np.arange(len(t_s)), -(-len(t_s) // _WINDOW))
+        ]
+        found.append(
+            Poses(*(np.concatenate([getattr(own, name) for own, _ in parts]) for name in ("root", "turn")))
+        )
+        costs.append(np.concatenate([cost for _, cost in parts]))
     chosen = _smoothest(np.stack([poses.turn for poses in found]), np.stack(costs), np.diff(t_s))
     at = chosen, np.arange(len(t_s))
     return Poses(

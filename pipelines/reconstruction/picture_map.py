@@ -47,6 +47,8 @@ KEY_PICTURES_OF_SHORT_FILM = 60
 MIN_KEY_STEP_S = 0.2
 # Two pictures a second keep a minute of film below 60 s of processor time, and overlap while a gimbal pans.
 MAX_KEY_STEP_S = 0.5
+# The adjustment of so many poses takes half a gigabyte; a longer film has fewer of them in a minute.
+MOST_KEY_PICTURES = 400
 # Points in smaller pictures are as accurate in the map as those in whole ones, in less time.
 LONGER_SIDE_PX = 1280
 # Points are followed through this many pictures a second: with fewer they move too far.
@@ -178,6 +180,7 @@ def key_rows(t_ns: Int64) -> Index:
     """Choose the rows of the key pictures among those of a film, by their times [T]."""
     span_s = float(t_ns[-1] - t_ns[0]) / 1e9
     step_s = np.clip(span_s / KEY_PICTURES_OF_SHORT_FILM, MIN_KEY_STEP_S, MAX_KEY_STEP_S)
+    step_s = max(step_s, span_s / MOST_KEY_PICTURES)
     wanted = np.linspace(t_ns[0], t_ns[-1], max(round(span_s / step_s), 1) + 1)
     return np.unique(np.searchsorted(t_ns, wanted).clip(max=len(t_ns) - 1))
 

@@ -622,7 +622,7 @@ class Manifest(YamlModel):
     actors: dict[str, ActorSource] = {}
     """Logged positions of several people by name."""
     stature_m: float | None = Field(None, ge=0.5, le=2.5)
-    """Height of the people who are filmed, m, which one camera needs to tell how far away they are."""
+    """Height of the people who are filmed, m: with it, a single camera places them better."""
     map: MapSource | None = None
     """Map of the surroundings."""
     truth: TruthSource | None = None

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
-from pipelines.keypoints.association import Association, Surroundings, associate, without_common_errors
+from pipelines.keypoints.association import (
+    Association,
+    Surroundings,
+    associate,
+    associate_one_camera,
+    without_common_errors,
+)
 from pipelines.keypoints.bodies import SightLines, find_bodies
 from pipelines.keypoints.corrections import Pair, mirrored_pairs, swaps_across_views
 from pipelines.reconstruction.observations import on_sides
@@ -235,6 +241,21 @@ def test_a_log_that_is_near_nobody_is_reported() -> None:
     result = scene.associate(1, straight((80.0, 0.0), (0.0, 0.0)))
     assert result.views[0] == scene.who.size
     assert "nobody is near the logged actor (nearest 77.0 m, median 80.0 m)" in result.reasons[0]
+
+
+def test_one_camera_gives_nobody_the_name_of_a_person_who_is_elsewhere() -> None:
+    """Log A, who is not filmed, and B, who is; then only somebody who is far away."""
+    scene, away = film([ACTOR], cameras=1), straight((80.0, 0.0), (0.0, 0.0))
+    views = SightLines(scene.xy, scene.confidence, scene.position, scene.rotation, scene.sigma)
+    heights = np.ones(len(scene.time_s))
+    a, b = (np.c_[log(scene.time_s), heights] for log in (away, ACTOR))
+    result = associate_one_camera(scene.time_s, views, actors=np.stack([a, b], axis=1), people=None)
+    assert result.unseen == (0,)
+    assert (result.choice[:, 0, 0] < 0).all()
+    assert (result.choice[:, 0, 1] >= 0).all()
+    result = associate_one_camera(scene.time_s, views, actors=a[:, None])
+    assert len(result.reasons) == 1
+    assert (result.choice[:, 0, 0] >= 0).all()
 
 
 def test_several_logged_people_are_the_bodies_that_fit_all_logs_best() -> None:

@@ -221,6 +221,11 @@ def test_one_camera_places_a_person_as_well_as_it_says(level_sigma_m: float, mos
     white = np.linalg.solve(body.centre_covariance, error[..., None])[..., 0]
     assert np.sum(error * white, axis=-1).mean() < 4.5
     assert abs(body.shape[0] - shape[0]) < 2.5 * np.sqrt(body.shape_covariance[0, 0])
+    # Two moments have no acceleration.
+    two = Rays(*(each[:2] for each in (rays.camera, rays.direction, rays.sigma)))
+    short = fit_seen_body(landmarks, t_ns[:2], two, points.ground, STATURE_M, exact[:2])
+    assert short is not None
+    assert np.isfinite(short.body.centre).all()
 
 
 def flat(at: Float) -> Float:
