@@ -62,8 +62,9 @@ def init_command(
     else:
         say(f"cameras: {', '.join(result.cameras) or 'none'}")
         say(f"written: {_from_here(result.path)}")
-        first = "write what is missing, then " if result.missing else ""
-        say_next(f"{first}mocap check {{}}", _from_here(result.path), shown.quiet)
+        if result.cameras:
+            first = "write what is missing, then " if result.missing else ""
+            say_next(f"{first}mocap check {{}}", _from_here(result.path), shown.quiet)
     if not result.cameras:
         raise SystemExit(1)
 

@@ -173,8 +173,8 @@ def draft(
     flight = match(candidates, logs, _MotionComparison(), _distance_m, ask)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
     text = manifest.text
-    if [target.parent.absolute()] == [_absolute(path) for path in paths]:
-        text += f"{_DRAFT}{_digest(text)} of {_digest(_listing(target.parent))}\n"
+    if [_absolute(target.parent)] == [_absolute(path) for path in paths]:
+        text += f"{_DRAFT}{_digest(text)} of {_digest(_listing(target))}\n"
     problem = _write(target, text)
     return Drafted(
         path=target,
@@ -186,7 +186,12 @@ def draft(
     )
 
 
+# The last line of a draft says what it was made of.
 _DRAFT = "# `mocap run` drafts it again when files are added, until you edit it: "
+
+
+_MADE = (".session", ".export")
+"""Ends of the names of folders that `mocap` makes."""
 
 
 def must_be_drafted(manifest: Path) -> bool:
@@ -203,20 +208,20 @@ def must_be_drafted(manifest: Path) -> bool:
     edited, _, files = digests.partition(" of ")
     if not mark or edited != _digest(text):
         return False
-    return "missing: " in text or files.strip() != _digest(_listing(manifest.parent))
+    return "missing: " in text or files.strip() != _digest(_listing(manifest))
 
 
 def _digest(text: str) -> str:
     return sha256(text.encode(errors="replace")).hexdigest()[:12]
 
 
-def _listing(home: Path) -> str:
-    """List the files in a folder with their sizes, without hidden ones, sessions and its flight.yaml."""
-    files: list[str] = []
+def _listing(manifest: Path) -> str:
+    """List the files beside a manifest with their sizes, without hidden ones and what `mocap` made."""
+    home, files = manifest.parent, list[str]()
     for folder, inner, names in os.walk(home):
-        inner[:] = sorted(name for name in inner if name[0] != "." and not name.endswith(".session"))
-        shown = [Path(folder, name).relative_to(home) for name in sorted(names) if name[0] != "."]
-        files += [f"{name} {(home / name).lstat().st_size}" for name in shown if str(name) != "flight.yaml"]
+        inner[:] = sorted(name for name in inner if name[0] != "." and not name.endswith(_MADE))
+        shown = [Path(folder, name) for name in sorted(names) if name[0] != "."]
+        files += [f"{each.relative_to(home)} {each.lstat().st_size}" for each in shown if each != manifest]
     return "\n".join(files)
 
 
@@ -298,7 +303,7 @@ class _FileSearch:
         except OSError as error:
             self.left_out[folder] = f"cannot be read ({error.strerror}), left out"
             return
-        children = [c for c in every if c.name[0] != "." and c.suffix != ".session" and c.exists()]
+        children = [c for c in every if c.name[0] != "." and c.suffix not in _MADE and c.exists()]
         formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
         if formats:
             yield folder, formats

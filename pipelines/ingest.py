@@ -87,7 +87,7 @@ from pipelines.sources.pictures import open_files
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=10)
+INGEST = Stage("ingest", revision=11)
 
 
 @dataclass(frozen=True)
@@ -227,9 +227,8 @@ class _FlightReader:
         self._cameras = FlightCameras(flight_path, self._logs, self._files, self.poses.triggers, note)
         self.hashes: Mapping[str, str] = {}  # SHA-256 of the sources by their names in the manifest
         self.progress: Progress = Silent()
-        self.check_sources: Callable[[], None] = lambda: (
-            None
-        )  # raises an error if they were changed meanwhile
+        # Raises an error if they were changed meanwhile.
+        self.check_sources: Callable[[], None] = lambda: None
         self.force = False  # maps of pictures of an earlier ingest are not used
         self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 

@@ -52,12 +52,14 @@ class DjiRows:
     rows: str = "rows"  # name of the rows where losses are counted
     repeats: bool = True  # a position is repeated until the next measurement
     zero_is_none: bool = False  # angles of a gimbal that are 0 throughout
+    level: bool = True  # a missing roll is 0
     dropped: Mapping[str, int] = field(default_factory=dict)
 
     def angles(self, part: str) -> Float:
-        """Return yaw, pitch, roll [N, 3] in degrees of `drone` or `gb`; a missing roll is 0."""
+        """Return yaw, pitch, roll [N, 3] in degrees of `drone` or `gb`."""
         yaw, pitch, roll = (self.columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll"))
-        roll = np.where(np.isnan(roll) & np.isfinite(yaw), 0.0, roll)
+        if self.level:
+            roll = np.where(np.isnan(roll) & np.isfinite(yaw), 0.0, roll)
         found = np.stack([yaw, pitch, roll], axis=1)
         is_none = self.zero_is_none and part == "gb" and not np.nan_to_num(found).any()
         return np.full_like(found, np.nan) if is_none else found

@@ -300,6 +300,7 @@ class PictureTags(DroneLog):
             names=("flight angles", "gimbal angles"),
             rows="pictures",
             repeats=False,
+            level=False,
         )
         return telemetry_of_rows(path, rows, choice, notes)
 
