@@ -726,6 +726,7 @@ def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
             ground=flight.ground,
             of_map=flight.description.map is not None,
             stature_m=flight.description.stature_m,
+            static=cameras[0].static,
         )
         return _Triangulated(
             seen, views, flight.waiting.put(one.result), solve, one.bodies, one.with_second_drone_mm

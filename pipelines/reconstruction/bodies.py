@@ -116,6 +116,7 @@ def bodies_of_one_camera(
     ground: Callable[[Float], tuple[Float, Float]] | None,
     of_map: bool,
     stature_m: float | None,
+    static: bool,
 ) -> OneCamera:
     """Fit a body to each person whom the only camera sees.
 
@@ -125,9 +126,10 @@ def bodies_of_one_camera(
         ground: gives the height of the ground under places [N, 3], NaN where it is unknown, and its error.
         of_map: the height is that of the top of a voxel, and the error its side.
         stature_m: as stated, None if nobody did.
+        static: the camera stands still, and its pose is exact unless its noise is stated.
 
     Raises:
-        DataError: the landmarks of the skeleton are not known, or the camera has no pose.
+        DataError: the landmarks of the skeleton are not known.
     """
     times, people, joints, _ = observations.confidence.shape
     known = landmarks_of(observations.joints)
@@ -140,14 +142,17 @@ def bodies_of_one_camera(
         )
     landmarks, columns = known
     noise = observations.pose_sigma
-    pose_sigma = np.tile(UNKNOWN_SIGMA, (times, 1)) if noise is None else noise[:, 0]
+    usual = (0.0, 0.0) if static else UNKNOWN_SIGMA
+    pose_sigma = np.tile(usual, (times, 1)) if noise is None else noise[:, 0]
     height = _height_of(ground, observations.position[:, 0], 0.5 if of_map else 0.0)
     stature = STATURE_M if stature_m is None else (stature_m, STATED_STATURE_SIGMA_M)
     place, status = np.full((times, people, joints, 3), np.nan), np.zeros((times, people, joints), np.int8)
     covariance = np.full((times, people, joints, 3, 3), np.nan)
     seen = np.isfinite(observations.rays[..., 0, :]).all(axis=-1) & (observations.confidence[..., 0] > 0)
-    seen &= np.isfinite(observations.position[:, None, None, 0]).all(axis=-1)
     status[:] = np.where(seen, STATUS.index("few_views"), STATUS.index("not_detected"))
+    posed = np.isfinite(observations.position[:, None, None, 0]).all(axis=-1)
+    status[seen & ~posed] = STATUS.index("no_pose")
+    seen &= posed
     bodies: list[BodyFit | None] = []
     for person in range(people):
         found = fit_seen_body(
@@ -185,8 +190,11 @@ def _rays_of(observations: Observations, person: int, columns: Index, seen: Bool
     ray = np.einsum("tij,tkj->tki", np.nan_to_num(observations.rotation[:, 0]), ray)
     confidence = observations.confidence[:, person, columns, 0]
     sigma = 1 / np.where(seen, confidence, 1.0)
-    camera = np.nan_to_num(observations.position[:, 0])
-    return Rays(camera, np.where(seen[..., None], ray, 0.0), sigma)
+    camera, moment = observations.position[:, 0].copy(), np.arange(len(seen))
+    posed = np.isfinite(camera).all(axis=1)
+    for axis in range(3) if posed.any() else ():  # bodies go on through short gaps of the log
+        camera[~posed, axis] = np.interp(moment[~posed], moment[posed], camera[posed, axis])
+    return Rays(np.nan_to_num(camera), np.where(seen[..., None], ray, 0.0), sigma)
 
 
 def _height_of(

@@ -103,6 +103,8 @@ _MOST_JUMP = 200.0
 # A detector errs by about this in a picture of a person 10 m away; it only weighs the first headings.
 _FIRST_SIGMA_RAD = 0.003
 _FIRST_STEPS, _STEPS = 8, 25
+# A prior of this weight holds the shape that a whole flight gave.
+_HELD = 1e6
 # Steps end when the cost of each moment falls by less.
 _SETTLED = 1e-3
 
@@ -178,19 +180,20 @@ def _fit_windows(
     points: StandingPoints, t_ns: Int64, row: Index, rays: Rays, poses: Poses, shared: Shared
 ) -> SeenBody:
     """Fit windows one after the other, and all again with the shape of all if there are several."""
-    starts = range(0, len(row), _WINDOW)
+    starts, whole = range(0, len(row), _WINDOW), None
     for start in starts if len(starts) > 1 else ():
         part = np.arange(start, min(start + _WINDOW, len(row)))
         fit = _fit(points, t_ns[row[part]], _of(rays, part), _poses_of(poses, part), shared)
-        shared = fit.shared
-        points.prior = SharedPrior(
-            shared.vector, np.asarray(np.linalg.inv(fit.shared_covariance), np.float64)
-        )
+        shared, whole = fit.shared, fit.shared_covariance
+        points.prior = SharedPrior(shared.vector, np.asarray(np.linalg.inv(whole), np.float64))
+    if whole is not None:  # every picture has told of the shape: none tells again
+        points.prior = SharedPrior(shared.vector, _HELD * points.prior.precision)
     parts = []
     for start in starts:
         stop = min(start + _WINDOW, len(row))
         part = np.arange(max(0, start - _OVERLAP), min(stop + _OVERLAP, len(row)))
         fit = _fit(points, t_ns[row[part]], _of(rays, part), _poses_of(poses, part), shared)
+        fit = fit if whole is None else fit._replace(shared=shared, shared_covariance=whole)
         inner = slice(start - part[0], stop - part[0])
         own = _poses_of(fit.poses, inner), fit.shared, fit.covariance[inner], fit.answer[inner]
         turning, *joints = points.spread_of_joints(*own, fit.shared_covariance)

@@ -303,7 +303,8 @@ def method_used(
     Returns:
         `background` and `ground`: the cameras whose poses they corrected, and the `reason` of each other;
         `clocks`: the cameras whose clocks were estimated; `body`: whether motion and bones took part, and
-        the `reason` if not; `pose_noise`: stated, logged, estimated, or none; `summary`: all that in a line.
+        the `reason` if not; `pose_noise`: stated, logged, estimated, assumed (of a
+        single camera), or none; `summary`: all that in a line.
     """
     used: dict[str, Any] = {}
     entries = metrics.get("background") or {}
@@ -323,10 +324,11 @@ def method_used(
     learned = refinement is not None and reason is None and refinement["pose_noise"] == "estimated"
     guessed = learned or bool(used["background"]["cameras"])
     exact = all(camera.static for camera in cameras)
+    noise = "none" if exact else "estimated" if guessed else "assumed" if len(cameras) == 1 else "none"
     used |= {
         "clocks": list(clocks_s),
         "body": {"used": reason is None, "reason": reason},
-        "pose_noise": known or ("estimated" if guessed and not exact else "none"),
+        "pose_noise": known or noise,
     }
     people = "the size of people, their feet on the ground, and motion" if len(cameras) == 1 else None
     return used | {"summary": _summary(used, clocks_s, people or "motion and bones")}
@@ -344,6 +346,7 @@ def _summary(used: Mapping[str, Any], clocks_s: Mapping[str, tuple[float, float]
         clocks = [f"{name} ({at:+.3f} s, sigma {sigma_s:.3f} s)" for name, (at, sigma_s) in clocks_s.items()]
         parts.append(f"estimated clocks of {', '.join(clocks)}")
     noise = {"none": "the poses as exact", "estimated": "pose noise estimated from the pictures"}
+    noise["assumed"] = "usual pose noise, which nobody stated"
     parts.append(noise.get(used["pose_noise"], f"{used['pose_noise']} pose noise"))
     left_out = [] if used["body"]["used"] else [f"motion and bones ({used['body']['reason']})"]
     for name in ("background", "ground"):
@@ -690,8 +693,8 @@ def verdict(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
         why.insert(len(doubts), f"one camera does not measure how far away a person is{less}")
     if cameras == 2:
         why.append("there are two cameras: nothing shows which of them is wrong where they disagree")
-    if kind == "estimated":
-        why.append("errors of the poses are not stated, and were estimated: set pose_noise if you know them")
+    if kind in ("estimated", "assumed"):
+        why.append(f"errors of the poses are not stated, and were {kind}: set pose_noise if you know them")
     if doubts:
         grade = "wrong"
     elif expected is None or share < LEAST_SHARE or expected[1] > USABLE_MM:

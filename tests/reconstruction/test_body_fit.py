@@ -13,6 +13,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
 )
 from pipelines.geometry.rig import BONES
+from pipelines.reconstruction import one_camera
 from pipelines.reconstruction.body_fit import (
     BodyFit,
     Landmarks,
@@ -181,7 +182,9 @@ def test_depths_that_parallel_rays_leave_open_have_no_weight() -> None:
 
 
 @pytest.mark.parametrize(("level_sigma_m", "most_mm"), [(0.05, 350.0), (UNKNOWN_LEVEL_SIGMA_M, 700.0)])
-def test_one_camera_places_a_person_as_well_as_it_says(level_sigma_m: float, most_mm: float) -> None:
+def test_one_camera_places_a_person_as_well_as_it_says(
+    level_sigma_m: float, most_mm: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """See somebody of 1.76 m who walks on the ground from 9 m away; keypoints err as the table says.
 
     The stature is known to 8 cm, which is 0.4 m of the distance; a ground that is known makes that 0.25 m.
@@ -221,6 +224,12 @@ def test_one_camera_places_a_person_as_well_as_it_says(level_sigma_m: float, mos
     white = np.linalg.solve(body.centre_covariance, error[..., None])[..., 0]
     assert np.sum(error * white, axis=-1).mean() < 4.5
     assert abs(body.shape[0] - shape[0]) < 2.5 * np.sqrt(body.shape_covariance[0, 0])
+    # In windows the flight says as much of the stature, and no more.
+    monkeypatch.setattr(one_camera, "_WINDOW", 20)
+    parts = fit_seen_body(landmarks, t_ns, rays, points.ground, STATURE_M, exact)
+    assert parts is not None
+    ratio = np.sqrt(parts.body.shape_covariance[0, 0] / body.shape_covariance[0, 0])
+    assert 0.8 < ratio < 1.5
     # Two moments have no acceleration.
     two = Rays(*(each[:2] for each in (rays.camera, rays.direction, rays.sigma)))
     short = fit_seen_body(landmarks, t_ns[:2], two, points.ground, STATURE_M, exact[:2])
