@@ -166,7 +166,7 @@ def associate_one_camera(
     seen = find_bodies(time_s, views, logs)
     track, there = seen.track[:, 0], np.isfinite(views.xy).all(axis=-1) & (views.confidence > 0)
     trust = np.where(there, views.confidence, 0.0).sum(axis=(1, 3))
-    ray = rays_of(views.xy[:, 0], np.nan_to_num(views.rotation[:, 0]))
+    ray = rays_of(views.xy[:, 0], np.nan_to_num(views.rotation[:, 0, None]))
     middle = known_median(np.where(there[:, 0, ..., None], ray, np.nan), axis=2)
     bodies = []
     for identity in np.unique(track[track >= 0]).tolist():

@@ -244,15 +244,16 @@ def test_a_log_that_is_near_nobody_is_reported() -> None:
 
 
 def test_one_camera_gives_nobody_the_name_of_a_person_who_is_elsewhere() -> None:
-    """Log A, who is not filmed, and B, who is; then only somebody who is far away."""
-    scene, away = film([ACTOR], cameras=1), straight((80.0, 0.0), (0.0, 0.0))
+    """Log A, who is not filmed, and B, who is, with somebody else; then only somebody who is far away."""
+    scene, away = film([ACTOR, ACROSS], cameras=1), straight((80.0, 0.0), (0.0, 0.0))
     views = SightLines(scene.xy, scene.confidence, scene.position, scene.rotation, scene.sigma)
     heights = np.ones(len(scene.time_s))
     a, b = (np.c_[log(scene.time_s), heights] for log in (away, ACTOR))
     result = associate_one_camera(scene.time_s, views, actors=np.stack([a, b], axis=1), people=None)
     assert result.unseen == (0,)
     assert (result.choice[:, 0, 0] < 0).all()
-    assert (result.choice[:, 0, 1] >= 0).all()
+    taken = np.take_along_axis(scene.who[:, 0], result.choice[:, 0, 1:2], axis=1)
+    assert (taken == 0).mean() > 0.97
     result = associate_one_camera(scene.time_s, views, actors=a[:, None])
     assert len(result.reasons) == 1
     assert (result.choice[:, 0, 0] >= 0).all()
