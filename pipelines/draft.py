@@ -43,8 +43,8 @@ from pipelines.formats.logs.messages import all_samples, header_ns, kind_of, sam
 from pipelines.formats.logs.positions import FIXES, pairs_of
 from pipelines.formats.logs.trajectories import attitudes_of, poses_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
-from pipelines.formats.videos.picture_folder import FolderPictures
-from pipelines.formats.videos.video import VideoReader, created_ns
+from pipelines.formats.videos.picture_folder import FolderPictures, picture_files, read_tags
+from pipelines.formats.videos.video import FORMAT, VideoReader, created_ns
 from pipelines.geometry.arrays import Float, Int64, Place, RelativeTo
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera, level_heading
@@ -414,7 +414,8 @@ def _described(
         film = replace(film, size=(index.width, index.height))
         made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
         clock = {SHARED_SECONDS: "whole seconds", UNTIMED: "none"}.get(index.codec, "own")
-        yield replace(film, length_ns=length_ns, made_ns=made_ns, clock=clock)
+        focal_35_mm = read_tags(picture_files(path)[0]).focal_35_mm if path.is_dir() else None
+        yield replace(film, length_ns=length_ns, made_ns=made_ns, clock=clock, focal_35_mm=focal_35_mm)
     elif isinstance(format_, MapFormat):
         try:
             grid = format_.read_map(path)
@@ -542,11 +543,9 @@ class _MotionComparison:
             other = match(multiply(attitude, ahead), gimbal, relative_to)
             if other and (best is None or np.nansum(other.gain) > np.nansum(best.gain)):
                 best = other
-        if turning:
-            return best
         own = match(body)
-        if isinstance(found, FlownPoses) and not found.of_body:
-            return own
+        if turning or (isinstance(found, FlownPoses) and not found.of_body):
+            return best if turning else own
         for down_deg in TRIED_DOWN_DEG:
             other = match(multiply(body, body_from_camera("forward", down_deg)))
             if other and (best is None or explains_better(other.gain, best.gain)):
@@ -574,8 +573,8 @@ def _followed_points(path: Path) -> TrackedPoints:
     """Follow points through the first pictures of a video, each for a fifth of a second."""
     import cv2
 
-    index = recognise(path, VideoFormat, "video").index(path)
-    pts_ns = index.pts_ns[index.pts_ns <= (WATCHED_NS if index.codec != UNTIMED else 0)]
+    index = FORMAT.index(path)
+    pts_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
     height = round(index.height * WATCHED_WIDTH_PX / index.width)
     follower = Follower()
     with FolderPictures(path) if path.is_dir() else VideoReader(path) as reader:

@@ -79,6 +79,7 @@ from pipelines.reconstruction.observations import (
     readout_of,
     time_base,
 )
+from pipelines.reconstruction.one_camera import STATURE_M
 from pipelines.reconstruction.refining import (
     RefinedFlight,
     RobustFlight,
@@ -103,6 +104,7 @@ from pipelines.reconstruction.results import (
 from pipelines.reconstruction.solving import (
     are_calibrated,
     noise_text,
+    placed_by_size,
     ray_sigma,
     refused_people,
     solver_for,
@@ -566,6 +568,8 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         cameras, background["background"], warnings = refine_cameras(
             cameras, flight.followed, errors, between=flight.between
         )
+        cameras, moved = _brought_together(flight, cameras, errors)
+        warnings += moved
         cameras = flight.waiting.put(cameras)
     binding = None
     if len(flight.stills) > 1:
@@ -643,6 +647,26 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
             ),
         ],
     )
+
+
+def _brought_together(
+    flight: LoadedFlight, cameras: list[Camera], errors: Sequence[PoseErrors | None]
+) -> tuple[list[Camera], list[str]]:
+    """Shift cameras whose logs are metres off to where all see the person; say so."""
+    if len(cameras) < 2:
+        return cameras, []
+    found = candidates(cameras, flight.between)
+    hips = flight.actors[0].hips_at(found.t_ns) if flight.actors else None
+    stature_m = flight.description.stature_m or STATURE_M[0]
+    shift = placed_by_size(cameras, found, errors, hips, stature_m=stature_m)
+    if not shift.any():
+        return cameras, []
+    moved = [
+        replace(camera, trajectory=replace(camera.trajectory, position=camera.trajectory.position + by))
+        for camera, by in zip(cameras, shift, strict=True)
+    ]
+    far = ", ".join(f"{c.name} {np.linalg.norm(by):.1f} m" for c, by in zip(cameras, shift, strict=True))
+    return moved, [f"rays of people do not meet: cameras start where people are {stature_m:g} m tall ({far})"]
 
 
 def clocks_of(

@@ -271,6 +271,7 @@ class FoundFilm(Proposal):
     length_ns: int = 0
     made_ns: int | None = None  # its start or its end, in UTC, by its metadata
     clock: str = "own"  # of pictures in a folder: their seconds, or none
+    focal_35_mm: float | None = None  # of pictures in a folder, as on film 36 mm wide
 
 
 @dataclass(frozen=True, eq=False)

@@ -479,7 +479,7 @@ def _lens(camera: CameraDraft) -> dict[str, object] | None:
     if film is None or focal_35_mm is None:
         return None
     width, height = film.size
-    focal_px = round(focal_35_mm / 36 * width, 1)
+    focal_px = round(focal_35_mm / 36 * max(film.size), 1)
     size: dict[str, object] = {"width": width, "height": height, "fx": focal_px, "fy": focal_px}
     return {**size, "cx": (width - 1) / 2, "cy": (height - 1) / 2, "assumed": True}
 

@@ -430,13 +430,13 @@ def _ask_for_the_rest(
 
 
 def _find_lenses(cameras: Sequence[CameraDraft], of: Mapping[str, Sequence[Proposal]], ask: Ask) -> None:
-    """Find focal lengths of cameras without a calibration: by their subtitles, else one for all by asking."""
+    """Find focal lengths without a calibration: by subtitles or EXIF, else one for all by asking."""
     flown = [c for c in of.get("pose", []) if isinstance(c, FlownPoses) and c.focal_35_mm]
     stated = {c.labels: c.focal_35_mm for c in flown}
     for camera in cameras:
         pose = camera.choices["pose"].taken if "pose" in camera.choices else None
         if camera.film is not None:
-            camera.focal_35_mm = stated.get(camera.film.labels)
+            camera.focal_35_mm = stated.get(camera.film.labels, camera.film.focal_35_mm)
         if isinstance(pose, FlownPoses) and pose.focal_35_mm:
             camera.focal_35_mm = pose.focal_35_mm
     unknown = [camera for camera in cameras if camera.focal_35_mm is None]

@@ -76,6 +76,8 @@ _LOSS = 1.0
 # Losses that come before it: where logged poses are many pixels off, a narrow one rejects all sightings
 # (graduated non-convexity: Blake and Zisserman 1987; Yang et al. 2020).
 _WIDE = (30.0, 5.0)
+# Two steps with a wide loss are too few for attitudes that are further off.
+_FAR_RAD = 0.1
 # Two sightings of a point determine its direction and depth and test nothing.
 _FEWEST_SIGHTINGS = 3
 _LONGEST_S, _LONGEST = 1.0, (12, 30)  # sightings of a point: time, and at least and at most these pictures
@@ -161,7 +163,10 @@ class PosePrior:
 
     @classmethod
     def of(cls, errors: PoseErrors | None) -> PosePrior:
-        """Build the prior from stated pose errors; None for unknown ones."""
+        """Build the prior from stated pose errors; None for unknown ones.
+
+        Whoever states no white errors leaves them open: poses that are exact in themselves are none of a log.
+        """
         if errors is None:
             slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
             return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, _UNKNOWN_ARM_M), slow, estimated=True)
@@ -174,7 +179,7 @@ class PosePrior:
                 changing[ROTATION if process.number == ROTATION else SHIFT_IN_WORLD].append(process)
         whole = (constant[SHIFT_IN_WORLD], constant[ROTATION], constant[SHIFT_IN_CAMERA])
         slow = (_sum(SHIFT_IN_WORLD, changing[SHIFT_IN_WORLD]), _sum(ROTATION, changing[ROTATION]))
-        return cls(errors.white, whole, slow)
+        return cls(errors.white if any(errors.white) else _UNKNOWN_WHITE, whole, slow)
 
     @property
     def level(self) -> Float:
@@ -589,7 +594,8 @@ class _Stretch:
         state = _StretchState(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
         for loss in _WIDE:
             settle = _SETTLE_ROUNDS if loss == _WIDE[0] else 0
-            found = self._solve(state, prior, rounds=2, loss=loss, settle=settle)
+            rounds = _ROUNDS if prior.constant[1] > _FAR_RAD else 2
+            found = self._solve(state, prior, rounds=rounds, loss=loss, settle=settle)
             if found is None:
                 return None
             state = found[0]

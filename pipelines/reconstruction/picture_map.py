@@ -15,13 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Float32, Index, Int64, Intrinsics, Picture
+from pipelines.geometry.arrays import Bool, Float, Index, Int64, Intrinsics, Picture
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import ROTATION, PoseErrors
 from pipelines.geometry.poses import (
@@ -37,7 +38,7 @@ from pipelines.geometry.poses import (
 from pipelines.reconstruction.background_tracks import Tracks, rays_at_stamps
 
 # Another number of features, pairs or key pictures gives other maps: kept maps of an older one are not used.
-REVISION = 2
+REVISION = 3
 
 # --- which pictures, and what is matched -----------------------------------------------------------------
 
@@ -60,14 +61,8 @@ MAX_FOLLOWED_STEP_S = 0.2
 MIN_PAIR_STEPS = 3
 # More features cost more matching (quadratic) and bind a picture no better.
 MAX_FEATURES = 1000
-# Key pictures are matched with those this many steps later; the far ones have the parallax.
-PAIR_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
-# Of so few key pictures all pairs are matched: a survey's legs overlap, and it takes seconds.
-MAX_PICTURES_FOR_ALL_PAIRS = 30
-# Lowe (2004): nearest neighbours at more than 0.8 of the second distance are mostly wrong.
-MAX_RATIO = 0.8
-# Descriptors of one point seen twice are closer (COLMAP's default).
-MAX_DESCRIPTOR_ANGLE_RAD = 0.7
+# A photograph is matched with so many later ones, and some at 32, 64, ... steps: a survey's legs overlap.
+MATCHED_STEPS = 30
 # Fewer matches of two pictures are chance (COLMAP's default).
 MIN_MATCHES = 15
 # Two sightings of a point test nothing.
@@ -269,18 +264,12 @@ def map_pictures(
     focal_px = (intrinsics.fx * intrinsics.fy) ** 0.5
     with TemporaryDirectory() as folder:
         place = Path(folder)
-        matched = _write_features(place / "features.db", features, intrinsics, focal_px)
+        matched = _matched_pairs(place / "features.db", features, intrinsics, focal_px)
         if matched < MIN_MAPPED_PICTURES:
             raise NoAttitudesError(
                 f"only {matched} pairs of its {len(features)} key pictures have {MIN_MATCHES} matches:"
                 " they are dark, blurred or without texture"
             )
-        verifying = pycolmap.TwoViewGeometryOptions(detect_watermark=False)
-        verifying.ransac.random_seed = SEED
-        one = pycolmap.GeometricVerifierOptions(num_threads=1)
-        pycolmap.geometric_verification(
-            place / "features.db", verifier_options=one, two_view_geometry_options=verifying
-        )
         options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=SEED)
         options.mapper.num_threads = options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
         options.mapper.bundle_adjustment.refine_focal_length = refine_focal
@@ -373,77 +362,66 @@ def _determines_focal(model: Any) -> bool:
     return abs(found_px / focal_px - 1) < MAX_FOCAL_DISAGREEMENT
 
 
-def _write_features(
+def _matched_pairs(
     path: Path, features: Sequence[KeyFeatures], intrinsics: Intrinsics, focal_px: float
 ) -> int:
     """Write features and matches as a database of pycolmap; return the number of pairs that match."""
     import pycolmap
 
-    width, height = intrinsics.width, intrinsics.height
+    middle = [intrinsics.width / 2, intrinsics.height / 2]
     database = pycolmap.Database.open(path)
     camera = pycolmap.Camera(
-        model="SIMPLE_PINHOLE", width=width, height=height, params=[focal_px, width / 2, height / 2]
+        model="SIMPLE_PINHOLE",
+        width=intrinsics.width,
+        height=intrinsics.height,
+        params=[focal_px, *middle],
+        has_prior_focal_length=True,
     )
-    camera.has_prior_focal_length = True
     camera.camera_id = database.write_camera(camera)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)
     rig_id = database.write_rig(rig)
+    film, sift = any(len(each.point) for each in features), pycolmap.FeatureExtractorType.SIFT
     ids = []
     for number, found in enumerate(features):
         image = pycolmap.Image(name=f"{number:06d}", camera_id=camera.camera_id)
         image.image_id = database.write_image(image)
-        frame = pycolmap.Frame()
-        frame.rig_id = rig_id
+        frame = pycolmap.Frame(rig_id=rig_id)
         frame.add_data_id(image.data_id)
         frame.frame_id = image.image_id
         database.write_frame(frame)
-        pixels = found.xy * focal_px + [width / 2, height / 2]
-        database.write_keypoints(image.image_id, pixels.astype(np.float32))
+        database.write_keypoints(image.image_id, (found.xy * focal_px + middle).astype(np.float32))
+        if not film:
+            described = pycolmap.FeatureDescriptors(type=sift, data=_rooted(found.descriptors))
+            database.write_descriptors(image.image_id, described)
         ids.append(image.image_id)
-    matched, count = 0, len(features)
-    film = any(len(each.point) for each in features)
-    steps: Sequence[int] = PAIR_STEPS
-    if film or count <= MAX_PICTURES_FOR_ALL_PAIRS:
-        steps = range(MIN_PAIR_STEPS if film else 1, count)
-    units = [_unit(each.descriptors) for each in features]
-    for first in range(count):
-        for second in (first + step for step in steps if first + step < count):
-            if film:
-                one, other = features[first].point, features[second].point
-                matches = np.stack(np.intersect1d(one, other, return_indices=True)[1:], axis=1)
-            else:
-                matches = match_features(units[first], units[second])
+    for first, second in combinations(range(len(features)) if film else (), 2):
+        if second - first >= MIN_PAIR_STEPS:
+            points = features[first].point, features[second].point
+            matches = np.stack(np.intersect1d(*points, return_indices=True)[1:], axis=1)
             if len(matches) >= MIN_MATCHES:
                 database.write_matches(ids[first], ids[second], matches.astype(np.uint32))
-                matched += 1
     database.close()
-    return matched
+    verifying = pycolmap.TwoViewGeometryOptions(detect_watermark=False)
+    verifying.ransac.random_seed = SEED
+    if film:
+        one = pycolmap.GeometricVerifierOptions(num_threads=1)
+        pycolmap.geometric_verification(path, verifier_options=one, two_view_geometry_options=verifying)
+    else:
+        matching = pycolmap.FeatureMatchingOptions(num_threads=1)
+        pairing = pycolmap.SequentialPairingOptions(overlap=MATCHED_STEPS, num_threads=1)
+        pycolmap.match_sequential(path, matching, pairing, verifying)
+    with pycolmap.Database.open(path) as verified:
+        return int(verified.num_verified_image_pairs())
 
 
-def _unit(descriptors: Picture) -> Float32:
-    """Return the square roots of descriptors of sum 1 (RootSIFT, Arandjelović and Zisserman 2012)."""
+def _rooted(descriptors: Picture) -> Picture:
+    """Return descriptors as COLMAP keeps them: square roots (RootSIFT, Arandjelović and Zisserman 2012)."""
     sums = descriptors.sum(axis=1, keepdims=True, dtype=np.float32)
-    root: Float32 = np.sqrt(descriptors / np.maximum(sums, 1), dtype=np.float32)
-    return root
-
-
-def match_features(ones: Float32, others: Float32) -> Index:
-    """Match unit descriptors [F, 128] and [G, 128]: nearest both ways, and clearly nearer than the second.
-
-    Returns rows [M, 2].
-    """
-    if len(ones) < 2 or len(others) < 2:
-        return np.empty((0, 2), np.int64)
-    alike = ones @ others.T
-    rows = np.arange(len(ones))
-    best = alike.argmax(axis=1)
-    back = alike.argmax(axis=0)
-    nearest = alike[rows, best].copy()
-    alike[rows, best] = -1
-    angle, second = (np.arccos(np.clip(each, -1, 1)) for each in (nearest, alike.max(axis=1)))
-    kept = (back[best] == rows) & (angle < MAX_RATIO * second) & (angle < MAX_DESCRIPTOR_ANGLE_RAD)
-    return np.stack([rows[kept], best[kept]], axis=1)
+    rooted: Picture = (
+        (512 * np.sqrt(descriptors / np.maximum(sums, 1))).round().clip(max=255).astype(np.uint8)
+    )
+    return rooted
 
 
 # --- laying a map on places ------------------------------------------------------------------------------

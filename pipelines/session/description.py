@@ -140,6 +140,7 @@ class PictureMapEntry(Entry):
     common_sigma_deg: float  # per axis, of the error that all attitudes share
     picture_sigma_deg: float  # per axis, of the error of each picture
     focal_ratio: float = 1.0  # refined focal length over the stated one
+    unlike_log: int = 0  # key pictures whose attitude the log has otherwise
 
 
 class CameraEntry(Entry):

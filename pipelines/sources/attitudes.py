@@ -11,6 +11,12 @@ import pyarrow as pa
 
 from pipelines.geometry.arrays import Index, Intrinsics
 from pipelines.geometry.noise import PoseErrors, pose_errors
+from pipelines.geometry.poses import (
+    conjugate,
+    interpolate_poses,
+    multiply,
+    rotation_vector_from_quaternion,
+)
 from pipelines.reconstruction.background_tracks import Follower
 from pipelines.reconstruction.picture_map import (
     REVISION,
@@ -54,6 +60,12 @@ MAP_FILES = ("picture_map.parquet", "picture_map_sightings.parquet")
 
 # A satellite receiver's error decorrelates in minutes (docs/flight.md, Poses).
 SATELLITE_CORRELATION_S = 100.0
+
+# A log's attitude that is further from the pictures' one is said: gimbals and compasses err by less.
+MAX_UNLIKE_DEG = 15.0
+
+# Logged attitudes further apart are not compared between: a drone takes photographs some seconds apart.
+MAX_COMPARED_GAP_S = 20.0
 
 # Positions of a log on board that state no errors are taken to have the constant ones of `UNKNOWN_SIGMA`.
 UNSTATED_BIAS_M = 0.3
@@ -106,7 +118,7 @@ def turned_by_pictures(
         film: its pictures.
         frames: their times.
         intrinsics: its lens.
-        places: its logged places; the rotations have no meaning.
+        places: its logged places; logged rotations are only compared, NaN for none.
         refine_focal: the focal length is a guess, and is refined where the pictures determine it.
         pose_noise: noise models of the manifest.
         satellite_sigma_m: standard deviation of satellite positions; None for positions of another kind.
@@ -139,8 +151,10 @@ def turned_by_pictures(
     position, turned = poses_of_pictures(laid, places.t_ns, places.position, frames.t_ns)
     known = np.isfinite(turned[:, 0])
     common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
+    unlike = _unlike_log(name, laid, places, note)
     entry = PictureMapEntry(
         key=key,
+        unlike_log=unlike,
         key_pictures=len(numbers),
         mapped=len(found.key),
         points=int(found.seen_point.max()) + 1,
@@ -172,6 +186,32 @@ def turned_by_pictures(
         found,
         entry,
     )
+
+
+def _unlike_log(name: str, laid: LaidMap, logged: Trajectory, note: Callable[[str], None]) -> int:
+    """Count the key pictures whose attitude the log has otherwise, and say when and by how much."""
+    rows = np.isfinite(logged.quaternion_xyzw).all(axis=1)
+    if not rows.any():
+        return 0
+    there = interpolate_poses(
+        logged.t_ns[rows],
+        logged.position[rows],
+        logged.quaternion_xyzw[rows],
+        laid.t_ns,
+        max_gap_ns=round(MAX_COMPARED_GAP_S * 1e9),
+        max_extrapolation_ns=0,
+    )[1]
+    away = rotation_vector_from_quaternion(multiply(conjugate(laid.quaternion_xyzw), there))
+    away_deg = np.degrees(np.linalg.norm(away, axis=1))
+    unlike = np.flatnonzero(away_deg > MAX_UNLIKE_DEG)
+    if len(unlike):
+        first_s, last_s = ((laid.t_ns[unlike[[0, -1]]] - laid.t_ns[0]) / 1e9).tolist()
+        note(
+            f"{name}: in {len(unlike)} of {len(away_deg)} key pictures, {first_s:.0f} to {last_s:.0f} s after"
+            f" the first, its log turns the camera otherwise than its pictures, by"
+            f" {float(np.median(away_deg[unlike])):.0f} deg: its pictures are believed"
+        )
+    return len(unlike)
 
 
 def _features(

@@ -143,8 +143,8 @@ class FlightPoses:
     def trajectory(self, name: str, camera: CameraSources, frames: CameraFrames) -> Trajectory:
         """Read world_from_camera over time; a static camera has one row, at the first of its frames.
 
-        With `attitude: pictures` only the positions have a meaning. DataError: nothing usable, or the
-        manifest does not state the camera's mount on the body.
+        With `attitude: pictures` rotations are there to be compared, NaN for none. DataError: nothing usable,
+        or the manifest does not state the camera's mount on the body.
         """
         pose = camera.pose
         if pose.by_pictures:
@@ -691,18 +691,24 @@ class FlightPoses:
         return in_world(poses, self._logs.settings(stated).world_from_source)
 
     def _places(self, name: str, camera: CameraSources) -> Trajectory:
-        """Return the places of a camera whose attitudes are found by its film; rotations have no meaning."""
+        """Return the places of a camera whose film says how it turned; rotations are NaN if not logged."""
         pose = camera.pose
         if self._is_joined(pose):
             telemetry = self._read(pose)
             for note in telemetry.notes:
                 self._note(note)
-            values, _ = self._in_world(name, telemetry.position)
-            level = np.tile(LEVEL, (len(values), 1))
-            logged = Trajectory(telemetry.position.t_ns, values, level, dropped=dict(telemetry.dropped))
+            values, turn = self._in_world(name, telemetry.position)
+            rotation = np.full((len(values), 4), np.nan)
+            logged = Trajectory(telemetry.position.t_ns, values, rotation, dropped=dict(telemetry.dropped))
+            gimbal = telemetry.gimbal
+            if gimbal is not None and gimbal.relative_to == "world":
+                gimbal = replace(gimbal, quaternion_xyzw=multiply(turn, gimbal.quaternion_xyzw))
+                logged = replace(logged, quaternion_xyzw=self._on_gimbal(gimbal, logged, *mounted(None))[1])
             placed = in_world(logged, self._logs.settings(pose.file).world_from_source)
         else:
             placed = self._local(*self._stated_poses(name, camera))
+            if not self._is_of_camera(camera):
+                placed = replace(placed, quaternion_xyzw=np.full_like(placed.quaternion_xyzw, np.nan))
         return replace(in_world(placed, pose.world_from_source), covariance=None)
 
     def satellite_sigma_m(self, camera: CameraSources) -> float | None:

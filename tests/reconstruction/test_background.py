@@ -14,6 +14,7 @@ from pipelines.geometry.noise import (
     SHIFT_IN_WORLD,
     SURVEYED_M,
     UNKNOWN_SIGMA,
+    Bias,
     Drift,
     GaussMarkov,
     NoiseModel,
@@ -568,6 +569,17 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
     assert entries["drone1"]["used"]
     changing_deg = float(np.std(left - left.mean(axis=0)))
     assert changing_deg > 0.08 if shutter == "rolling, not stated" else changing_deg < 0.04
+
+
+def test_a_bias_of_20_deg_is_found_beside_white_errors_that_nobody_stated() -> None:
+    rng = np.random.default_rng(3)
+    position, rotation = flown(60, 8.0)
+    at, turned = logged(position, rotation, rng)
+    wrong = turned @ matrix_from_quaternion(quaternion_from_rotation_vector(np.radians([12.0, -14.0, 9.0])))
+    stated = PosePrior.of(pose_errors([Bias(position_m=1.5, rotation_deg=20)]))
+    found = adjusted(*sighted(position, rotation, rng), (at + 1.5, wrong), stated)
+    assert found.refused is None
+    assert np.abs(errors_deg(found.rotation, rotation).mean(axis=0)).max() < 0.5
 
 
 def test_an_unstated_lever_arm_leaves_an_attitude_uncertain() -> None:

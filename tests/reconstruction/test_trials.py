@@ -1,5 +1,6 @@
 """Disturbed poses: independence of the random draws, refused options, and the summary of several trials."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,12 @@ import pytest
 from scipy.stats import t
 
 from pipelines.geometry.arrays import Intrinsics
+from pipelines.geometry.noise import Bias, pose_errors
+from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.reconstruction.loading import PoseDisturbance, disturbed
-from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.observations import Camera, Candidates
 from pipelines.reconstruction.results import GOOD_MM, USABLE_MM, summary_of_trials, verdict
+from pipelines.reconstruction.solving import placed_by_size
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections, Trajectory
 
@@ -48,6 +52,24 @@ def test_each_camera_and_trial_has_its_own_chance_whatever_else_is_asked() -> No
     assert not np.allclose(two, moved("white:position_m=0.1", seed=1))
     # Latency does not change a camera that stands still.
     assert not moved("latency:latency_ms=50").any()
+
+
+def test_cameras_that_are_metres_off_start_where_people_have_their_size() -> None:
+    person, times = np.array([[0, 0, 1.53], [0, 0.1, 0], [0, -0.1, 0]]), 6  # of 1.70 m
+    at, off = np.array([[9.0, 1, 4], [-2, 8, 3]]), np.array([[4.0, -6, 3], [-3, 5, 2]])
+    rotation = matrix_from_quaternion(look_at(at, np.zeros((2, 3))))
+    seen = np.einsum("cji,ckj->cki", rotation, person - at[:, None])
+    each = seen[:, None, :, :2] / seen[:, None, :, 2:], np.ones((2, 1, 3)), at + off, rotation
+    every = [np.tile(part, (times, *(1,) * part.ndim)) for part in each]
+    found = Candidates(np.arange(times), np.zeros((times, 2), np.int64), *every)
+    named = replace(camera("drone1").detections, joints=("nose", "left_ankle", "right_ankle"))
+    cameras = [replace(camera("drone1"), detections=named), camera("drone2")]
+    wide, narrow = (2 * [pose_errors([Bias(position_m=size_m)])] for size_m in (50.0, 0.5))
+    left = placed_by_size(cameras, found, wide, None, stature_m=1.7) + off
+    assert np.ptp(left, axis=0).max() < 0.1  # all are off alike
+    hips = np.tile([0.0, 0.0, 0.77], (times, 1))
+    assert np.abs(placed_by_size(cameras, found, wide, hips, stature_m=1.7) + off).max() < 0.1
+    assert not placed_by_size(cameras, found, narrow, hips, stature_m=1.7).any()
 
 
 @pytest.mark.parametrize(

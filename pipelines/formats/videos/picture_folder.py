@@ -27,7 +27,7 @@ _SECOND_NS = 1_000_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _TAG = re.compile(rb"(?<![\w/-])drone(?:-dji)?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
 _EXIF, _GPS = 0x8769, 0x8825
-_TAKEN, _OFFSET, _SUBSECOND = 36867, 36881, 37521
+_TAKEN, _OFFSET, _SUBSECOND, _FOCAL_35_MM = 36867, 36881, 37521, 41989
 NAMES = {
     "latitude": ("GpsLatitude", "Latitude"),
     "longitude": ("GpsLongitude", "GpsLongtitude", "Longitude"),
@@ -52,6 +52,7 @@ class Tags:
 
     t_ns: int | None
     values: Mapping[str, float] = field(default_factory=dict)
+    focal_35_mm: float | None = None  # focal length as on film 36 mm wide
 
 
 def picture_files(folder: Path) -> list[Path]:
@@ -91,7 +92,7 @@ def read_tags(path: Path) -> Tags:
             number = _number(xmp.get(name))
             if number is not None:
                 values[column] = number
-    return Tags(_taken_ns(taken), values)
+    return Tags(_taken_ns(taken), values, _number(taken.get(_FOCAL_35_MM)) or None)
 
 
 def picture_times(tags: Sequence[Tags]) -> tuple[Int64, bool]:

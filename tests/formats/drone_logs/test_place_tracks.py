@@ -9,7 +9,6 @@ import pytest
 
 from pipelines.formats.drone_logs.place_tracks import GPX, PLACES_CSV
 from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
-from pipelines.session.errors import DataError
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import TelemetryChoice, TelemetryFormat
 from tests.real_data import real_data
@@ -81,11 +80,3 @@ def test_a_track_by_pymavlink_is_read(tmp_path: Path) -> None:
     assert listed.count("<trkpt") >= len(found) > 100
     apart = np.abs(ours[None, :, :2] - found[:, None, :2]).max(axis=2).min(axis=1)
     assert np.median(apart) < 1e-6
-
-
-def test_a_track_without_points_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.gpx"
-    path.write_text("<gpx></gpx>", encoding="utf-8")
-    with pytest.raises(DataError) as caught:
-        GPX.read_telemetry(path, TelemetryChoice())
-    assert caught.value.code == "empty"

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from pipelines.formats.videos import picture_folder
-from pipelines.formats.videos.picture_folder import FolderPictures, Tags, picture_times
+from pipelines.formats.videos.picture_folder import FolderPictures, Tags, picture_times, read_tags
 from pipelines.geometry.poses import rotate
 from pipelines.session.recognition import recognise
 from pipelines.session.records import UNTIMED
@@ -45,7 +45,7 @@ def write(
             half = 25 + 50 * k
             own = {36867: f"2024:01:02 03:04:{5 + half // 100:02d}"}
             own |= {37521: f"{half % 100:02d}"} if parts else {}
-            tags[0x8769] = own | ({36881: offset} if offset else {})
+            tags[0x8769] = own | {41989: 24} | ({36881: offset} if offset else {})
         if gps:
             degrees = {1: "N", 2: (48.0, 6.0, 0.0036 * k), 3: "E", 4: (11.0, 30.0, 0.0), 6: 530.0}
             tags[0x8825] = degrees
@@ -70,6 +70,7 @@ def test_pictures_are_in_the_order_of_their_numbers_with_exif_times(tmp_path: Pa
 def test_tags_of_dji_are_poses(tmp_path: Path) -> None:
     folder = write(tmp_path / "film")
     assert TAGS.recognises(folder)
+    assert read_tags(folder / "DJI_9.JPG").focal_35_mm == 24
     telemetry = TAGS.read_telemetry(folder, TelemetryChoice())
     assert telemetry.position.t_ns.tolist() == [START_NS + 500_000_000 * k for k in range(COUNT)]
     expected = [[48.1 + 1e-6 * k, 11.5, 30 + 0.1 * k] for k in range(COUNT)]
