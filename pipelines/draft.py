@@ -44,7 +44,7 @@ from pipelines.formats.logs.positions import FIXES, pairs_of
 from pipelines.formats.logs.trajectories import attitudes_of, poses_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import FolderPictures, picture_files, read_tags
-from pipelines.formats.videos.video import FORMAT, VideoReader, created_ns
+from pipelines.formats.videos.video import VideoReader, created_ns
 from pipelines.geometry.arrays import Float, Int64, Place, RelativeTo
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera, level_heading
@@ -543,9 +543,11 @@ class _MotionComparison:
             other = match(multiply(attitude, ahead), gimbal, relative_to)
             if other and (best is None or np.nansum(other.gain) > np.nansum(best.gain)):
                 best = other
+        if turning:
+            return best
         own = match(body)
-        if turning or (isinstance(found, FlownPoses) and not found.of_body):
-            return best if turning else own
+        if isinstance(found, FlownPoses) and not found.of_body:
+            return own
         for down_deg in TRIED_DOWN_DEG:
             other = match(multiply(body, body_from_camera("forward", down_deg)))
             if other and (best is None or explains_better(other.gain, best.gain)):
@@ -573,8 +575,8 @@ def _followed_points(path: Path) -> TrackedPoints:
     """Follow points through the first pictures of a video, each for a fifth of a second."""
     import cv2
 
-    index = FORMAT.index(path)
-    pts_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
+    index = recognise(path, VideoFormat, "video").index(path)
+    pts_ns = index.pts_ns[index.pts_ns <= (WATCHED_NS if index.codec != UNTIMED else 0)]
     height = round(index.height * WATCHED_WIDTH_PX / index.width)
     follower = Follower()
     with FolderPictures(path) if path.is_dir() else VideoReader(path) as reader:

@@ -29,6 +29,10 @@ COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5,
 # Over the picture's width. A fisheye lens of 220 deg whose circle is half as wide as the picture has 0.13.
 MIN_FOCAL_SHARE = 0.05
 
+# Principal points of whole pictures lie nearer to the middle, as a share of the sides. That of a picture of
+# half the size is off by a quarter.
+FAR_OFF_CENTRE = 0.2
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -73,6 +77,17 @@ class Intrinsics:
             problems.append(f"distortion coefficients {list(self.distortion)} are not all finite")
         if problems:
             raise ValueError("; ".join(problems))
+        # A reader may give numbers of NumPy, which JSON does not take.
+        plain = {"width": int, "height": int, "fx": float, "fy": float, "cx": float, "cy": float}
+        for name, kind in plain.items():
+            object.__setattr__(self, name, kind(getattr(self, name)))
+        object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
+
+    @property
+    def off_centre(self) -> float:
+        """Distance of the principal point from the middle of the picture, as a share of its sides."""
+        x, y = (self.cx + 0.5) / self.width, (self.cy + 0.5) / self.height
+        return max(abs(x - 0.5), abs(y - 0.5))
 
 
 @dataclass(frozen=True)

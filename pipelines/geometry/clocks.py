@@ -82,7 +82,8 @@ def _median_slope(t_s: Float, lead_s: Float) -> float:
 _MIN_STEP_S = 0.02
 # A clock that is set by more was never set before, or the log is played again: that is told, not mended.
 MAX_STEP_S = 2.0
-# A step is this many times the scatter of the messages before and after it.
+# A step is this many times the standard error of the medians of the messages before and after it, and a gap
+# this many times the scatter of intervals.
 _SIGNIFICANT_STEP_SIGMAS = 8.0
 # A step holds for at least this time before and after.
 _MIN_DURATION_S = 0.5
@@ -126,7 +127,7 @@ def find_steps(header_ns: Int64, receive_ns: Int64) -> list[ClockStep]:
     lead_s = (header - receive - (header[0] - receive[0])) / 1e9
     offset_s = float(header[0] - receive[0]) / 1e9
     interval_s = np.diff(header) / 1e9
-    usual_s = max(float(np.median(np.diff(receive))) / 1e9, 1e-6)
+    usual_s = max(float(np.median(interval_s)), 1e-6)
     window = max(_MIN_MESSAGES, int(np.ceil(min(_MIN_DURATION_S / usual_s, len(stamped)))))
     found = []
     for k in _candidates(lead_s, interval_s).tolist():
@@ -142,16 +143,19 @@ def find_steps(header_ns: Int64, receive_ns: Int64) -> list[ClockStep]:
         around_s = interval_s[first : last - 1]
         own_s = interval_s[k] - float(np.median(around_s))
         uneven_s = np.quantile(np.abs(around_s - np.median(around_s)), _SEPARATED_SHARE)
-        least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(off)))
+        scatter_s = 1.4826 * float(np.median(off)) * float(np.sqrt(np.pi))
+        sigma_s, near_sigma_s = scatter_s / np.sqrt(window), scatter_s / np.sqrt(_MIN_MESSAGES)
         if (
-            least_s < abs(step_s) <= MAX_STEP_S
+            max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * sigma_s) < abs(step_s) <= MAX_STEP_S
             and abs(own_s - step_s) < abs(step_s) / 2
-            and abs(near_s - step_s) < abs(step_s) / 4
+            and abs(near_s - step_s) < abs(step_s) / 4 + 2 * near_sigma_s
             and pause_s < 3 * usual_s + abs(step_s) / 2  # the receipt goes on
             and uneven_s < abs(step_s) / 4
             and lasted_s > _MIN_DURATION_S / 2  # messages of a queue arrive at once
             and np.quantile(off, _SEPARATED_SHARE) < abs(step_s) / 2
         ):
+            if uneven_s < sigma_s and abs(own_s - step_s) < max(usual_s / 2, 3 * sigma_s):
+                step_s = own_s  # the header's own interval has less scatter
             delay_s = -offset_s - level_s  # before the step, as if earlier steps had not been
             is_queue = 0 < step_s <= delay_s < MAX_STEP_S
             offset_s -= 0 if is_queue else step_s

@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.videos.picture_folder import taken_ns
 from pipelines.formats.videos.video import black_bars, created_ns
-from pipelines.geometry.arrays import Int64, Intrinsics
+from pipelines.geometry.arrays import FAR_OFF_CENTRE, Int64, Intrinsics
 from pipelines.geometry.cameras import fit_to_size, is_resized
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
@@ -24,9 +24,9 @@ from pipelines.sources.parts import CameraFrames
 # So many frames last 18 hours at 30 Hz: a larger number was misread from a date.
 MAX_FRAMES = 2_000_000
 
-# Of half the picture's size: cameras' principal points lie nearer to the middle (a few per cent), while
+# Of the picture's sides: cameras' principal points lie nearer to the middle (a few per cent), while
 # pictures of another usual size (3/4, 2/3, 1/2 of it) have their middle further off.
-MAX_CENTRE_OFFSET = 0.2
+MAX_CENTRE_OFFSET = 0.1
 
 # Shares of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. But if the
 # pictures have another size, keypoints lie beyond the right and the lower border only: all begin at 0.
@@ -214,6 +214,12 @@ class FlightCameras:
             intrinsics = self._logs.intrinsics(source.file, source.topic)
         else:
             intrinsics = _inline_intrinsics(source, place)
+        if intrinsics.off_centre > FAR_OFF_CENTRE:
+            self._note(
+                f"{name}: its principal point {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px is far from the"
+                f" middle of {intrinsics.width} x {intrinsics.height} px, as of a part of a sensor, or of the"
+                " calibration of another size"
+            )
         if source.readout_s:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
         if size := self._picture_size(camera, video, detections):
@@ -268,15 +274,15 @@ def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Pat
     if size is None:
         problem = "states no picture size, and no video does"
         raise DataError(source, problem, "add the size to the calibration", code="wrong-size")
-    offset = np.abs(np.divide((2 * intrinsics.cx + 1, 2 * intrinsics.cy + 1), size) - 1)
-    if offset.max() > MAX_CENTRE_OFFSET:
+    sized = replace(intrinsics, width=size[0], height=size[1])
+    if sized.off_centre > MAX_CENTRE_OFFSET:
         problem = (
             f"has its principal point at {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px, which is not the middle"
             f" of pictures of {size[0]} x {size[1]} px"
         )
         remedy = "give the calibration of these pictures, or the size of its own"
         raise DataError(source, problem, remedy, code="wrong-size")
-    return replace(intrinsics, width=size[0], height=size[1])
+    return sized
 
 
 def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:

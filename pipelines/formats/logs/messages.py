@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.arrays import FAR_OFF_CENTRE, Float, Int64, Intrinsics
 from pipelines.geometry.clocks import ClockStep, find_steps, fit_clock, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
@@ -43,8 +43,6 @@ _FISHEYE_MODELS = {"equidistant", "fisheye", "kannala_brandt"}
 _RADTAN_MODELS = {"plumb_bob", "rational_polynomial", "radtan"}
 _NO_MODELS = {"", "none"}  # without distortion
 
-# Principal points of whole pictures lie nearer to their middle, as for calibrations without a size.
-_FAR_OFF_CENTRE = 0.2
 _SIGNATURES = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png"}
 
 
@@ -206,16 +204,10 @@ def _lens(message: Message, source: Source, matrix: Float, distortion: list[floa
     )
     binned = _of_the_picture(full, value)
     undivided = replace(full, width=binned.width, height=binned.height)
-    if _off_centre(binned) > _FAR_OFF_CENTRE >= _off_centre(undivided):
+    if binned.off_centre > FAR_OFF_CENTRE >= undivided.off_centre:
         size = f"{binned.width} x {binned.height} px"
         return undivided, f"topic {topic}: its K is of the binned {size} already, by its principal point"
     return binned, ""
-
-
-def _off_centre(lens: Intrinsics) -> float:
-    """Return how far the principal point is from the middle, as a share of the picture's sides."""
-    x, y = (lens.cx + 0.5) / lens.width, (lens.cy + 0.5) / lens.height
-    return max(abs(x - 0.5), abs(y - 0.5))
 
 
 def _of_the_picture(full: Intrinsics, value: Any) -> Intrinsics:

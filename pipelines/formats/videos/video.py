@@ -10,6 +10,7 @@ from __future__ import annotations
 import bisect
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
@@ -351,10 +352,9 @@ def _scan(path: Path) -> _Scan:
         tick_s, listed = Fraction(stream.time_base or 0), stream.frames
         is_raw = container.format.name in _RAW
     if is_raw:
-        # A decoder begins at the first key frame.
-        begin = next((k for k, packet in enumerate(stored) if packet.key), len(stored))
+        unseen = _unseen_at_the_start(path)
         scan = _Scan(np.arange(len(stored), dtype=np.int64), Fraction(1), [], {}, is_raw)
-        return scan.without_first(begin) if begin else scan
+        return scan.without_first(unseen) if unseen else scan
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
@@ -384,6 +384,25 @@ def _scan(path: Path) -> _Scan:
         np.flatnonzero(np.isin(ticks, [pts for pts, key in sure if key]) & once).tolist(),
         {cause: count for cause, count in counts.items() if count},
     )
+
+
+def _unseen_at_the_start(path: Path) -> int:
+    """Count the coded frames up to the third key frame that no decoder gives."""
+    from av.error import FFmpegError
+
+    container, stream = open_container(path)
+    with container:
+        unseen = keys = 0
+        for packet in packets(container, stream):
+            keys += packet.is_keyframe
+            if keys > 2:
+                break
+            unseen += 1
+            with suppress(FFmpegError):
+                unseen -= len(stream.decode(packet))
+        with suppress(FFmpegError):
+            unseen -= len(stream.decode(None))
+    return max(unseen, 0)
 
 
 def _is_mirrored(frame: VideoFrame) -> bool:

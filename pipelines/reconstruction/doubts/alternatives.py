@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, permutations, product
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -270,7 +271,13 @@ def discrete(trial: Trial) -> Iterator[Alternative]:
     """Try exchanged pictures, other mounts and gimbals, other conventions, and other keypoints."""
     yield from _exchanged_pictures(trial)
     scene = trial.described
-    for row in chain(_mounts(trial), _gimbals(trial), _conventions(trial)) if trial.moving else ():
+    written: dict[tuple[str, bool], list[int]] = {}  # who wrote the poses
+    for index in trial.moving:
+        poses = trial.cameras[index].entry.poses
+        written.setdefault((Path(poses.source).suffix.lower(), poses.topic is None), []).append(index)
+    kinds: list[Sequence[int] | None] = [None, *(written.values() if len(written) > 1 else ())]
+    conventions = chain.from_iterable(_conventions(trial, kind) for kind in kinds)
+    for row in chain(_mounts(trial), _gimbals(trial), conventions) if trial.moving else ():
         group = trial.moving if row.group is None else row.group
         rotation, position = scene.rotation.copy(), scene.position.copy()
         rotation[group] = row.rotation[group]
@@ -403,13 +410,18 @@ def _frames(body: Float) -> dict[str, Float]:
     }
 
 
-def _conventions(trial: Trial) -> Iterator[Posed]:
-    """Try other meanings of the logged poses: axes, inverses, orders of quaternions, units."""
+def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
+    """Try other meanings of the logged poses: axes, inverses, orders of quaternions, units.
+
+    `kind` are the cameras with logs of one kind; None for all that move.
+    """
+    moving = trial.moving if kind is None else kind
+    price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
     scene, cameras, mounts = trial.described, trial.cameras, trial.mounts
     camera, place = scene.rotation, scene.position
     body = camera @ mounts.mT
     on_gimbal = {}
-    for index in trial.moving:
+    for index in moving:
         own = _body(trial, index)
         if own is not None:
             body[index] = own
@@ -424,18 +436,18 @@ def _conventions(trial: Trial) -> Iterator[Posed]:
                 turned[index] = after @ before.mT @ camera[index]
         return turned
 
-    stated = cameras[trial.moving[0]].entry.poses
+    stated = cameras[moving[0]].entry.poses
     # The exchange of axes is its own inverse.
     axes, frame = ("enu", "FLU") if stated.axes == "ned" else ("ned", "FRD")
     in_axes = f"the poses are in {axes.upper()}, of"
     of_camera, of_body = (
         f"world_from_{of}" if stated.inverse else f"{of}_from_world" for of in ("camera", "body")
     )
-    exchanged = remedies.pose(cameras, f"axes: {axes}")
-    upside_down = remedies.pose(cameras, remedies.upside_down)
-    inverted = remedies.pose(cameras, remedies.inverse)
-    its_own = remedies.pose(cameras, remedies.OF_CAMERA)
-    the_body = remedies.pose(cameras, remedies.OF_BODY)
+    exchanged = remedies.pose(cameras, moving, f"axes: {axes}")
+    upside_down = remedies.pose(cameras, moving, remedies.upside_down)
+    inverted = remedies.pose(cameras, moving, remedies.inverse)
+    its_own = remedies.pose(cameras, moving, remedies.OF_CAMERA)
+    the_body = remedies.pose(cameras, moving, remedies.OF_BODY)
     z = "up" if stated.z == "down" else "down"
     turned = carried_by(_ENU_FROM_NED @ body @ _FLU_FROM_FRD)
     camera_back, body_back = camera.mT, body.mT
@@ -453,36 +465,40 @@ def _conventions(trial: Trial) -> Iterator[Posed]:
         ("convention", "the poses are of the body, and are taken for the camera's", the_body, on_body, place),
         ("convention", "the poses are of the camera, and are taken for the body's", its_own, body, place),
     ]
-    if np.nanmedian(place[trial.moving, :, 2]) < 0:  # nobody takes off far above where they fly
+    if np.nanmedian(place[moving, :, 2]) < 0:  # nobody takes off far above where they fly
         what = f"the positions count z {z}wards, the attitudes do not"
         table.append(("axes", what, upside_down, camera, below))
-    held = [cameras[index].entry.poses for index in trial.moving]
+    held = [cameras[index].entry.poses for index in moving]
     if any(poses.mount or poses.in_gimbal for poses in held):
         table.append(("axes", f"{in_axes} a body with {frame} axes", exchanged, turned, ned))
     if any(poses.mount is None for poses in held):
         table.append(("axes", f"{in_axes} the camera", exchanged, _ENU_FROM_NED @ camera, ned))
     if any(poses.mount for poses in held):
         # Of poses of the camera itself, it would be a roll by 180 deg.
-        remedy = remedies.mount(cameras, trial.moving, before=_FLU_FROM_FRD)
+        remedy = remedies.mount(cameras, moving, before=_FLU_FROM_FRD)
         what = "the body's axes are FRD (forward, right, down)"
         table.append(("axes", what, remedy, body @ _FLU_FROM_FRD @ mounts, place))
     for attitudes, of_cameras in ((camera, np.asarray), (body, carried_by)):
         quaternion = quaternion_from_matrix(np.where(np.isfinite(attitudes), attitudes, np.eye(3)))
         for roll, order in ((-1, "wxyz"), (1, "xyzw")):
             turned = matrix_from_quaternion(np.roll(quaternion, roll, axis=-1))
-            remedy = remedies.pose(cameras, f"quaternion: {order}")
+            remedy = remedies.pose(cameras, moving, f"quaternion: {order}")
             what = f"the quaternions are written as {' '.join(order)}"
             table.append(("convention", what, remedy, of_cameras(turned), place))
     for code, what, remedy, rotation, position in table:
-        yield Posed(code, what, remedy or f"write the log again, since {what}", rotation, position)
+        yield Posed(
+            code, what, remedy or f"write the log again, since {what}", rotation, position, kind, price
+        )
     # Lever arms are stated in metres, whatever the log's unit.
     arms = np.einsum("ctij,cj->cti", body, np.array([each.lever_m for each in cameras]))
     for name, metres in _UNITS_M.items():
         what, again = f"the positions are in {name}", f", and {1 / metres:.4g} times what is read"
         for unit, factor, known in ((name, metres, ""), ("m", 1 / metres, again)):
             said = what.replace(name, unit) + known
-            remedy = remedies.pose(cameras, f"unit: {unit}")
-            yield Posed("unit", said, remedy, camera, (place - arms) * factor + arms, same_scatter=True)
+            remedy = remedies.pose(cameras, moving, f"unit: {unit}")
+            yield Posed(
+                "unit", said, remedy, camera, (place - arms) * factor + arms, kind, price, same_scatter=True
+            )
 
 
 def _keypoints(trial: Trial) -> Iterator[Alternative]:

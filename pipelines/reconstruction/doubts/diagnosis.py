@@ -435,7 +435,7 @@ def _below_zero(objective: Objective) -> list[Tried]:
             "axes",
             trial.names,
             "all drones fly below zero: their positions count z downwards, or zero is high above the ground",
-            remedies.pose(trial.cameras, remedies.upside_down),
+            remedies.pose(trial.cameras, trial.moving, remedies.upside_down),
             PRICE_OF_ALL,
             replace(trial.described, position=place),
         )

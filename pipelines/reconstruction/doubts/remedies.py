@@ -168,15 +168,14 @@ def unit(cameras: Sequence[Filmed], name: str) -> str:
     return _lines(cameras, range(len(cameras)), lambda _: f"pose.unit: {name}")
 
 
-def pose(cameras: Sequence[Filmed], said: str | Callable[[PosesEntry], str]) -> str:
-    """State how the poses of the moving cameras are written, beside how they are read."""
-    moving = [index for index in range(len(cameras)) if not cameras[index].static]
+def pose(cameras: Sequence[Filmed], group: Sequence[int], said: str | Callable[[PosesEntry], str]) -> str:
+    """State how the poses of moving cameras are written, beside how they are read."""
 
     def line(camera: Filmed) -> str:
         stated = said if isinstance(said, str) else said(camera.entry.poses)
         return "pose." + stated.format(camera.name)
 
-    return _lines(cameras, moving, line)
+    return _lines(cameras, group, line)
 
 
 def inverse(poses: PosesEntry) -> str:
