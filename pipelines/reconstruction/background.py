@@ -165,7 +165,7 @@ class PosePrior:
     def of(cls, errors: PoseErrors | None) -> PosePrior:
         """Build the prior from stated pose errors; None for unknown ones.
 
-        Whoever states no white errors leaves them open: poses that are exact in themselves are none of a log.
+        Where only a large constant rotation is stated, white errors are open: no log is exact in itself.
         """
         if errors is None:
             slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
@@ -179,7 +179,8 @@ class PosePrior:
                 changing[ROTATION if process.number == ROTATION else SHIFT_IN_WORLD].append(process)
         whole = (constant[SHIFT_IN_WORLD], constant[ROTATION], constant[SHIFT_IN_CAMERA])
         slow = (_sum(SHIFT_IN_WORLD, changing[SHIFT_IN_WORLD]), _sum(ROTATION, changing[ROTATION]))
-        return cls(errors.white if any(errors.white) else _UNKNOWN_WHITE, whole, slow)
+        left_out = not any(errors.white) and whole[1] > _FAR_RAD
+        return cls(_UNKNOWN_WHITE if left_out else errors.white, whole, slow)
 
     @property
     def level(self) -> Float:
