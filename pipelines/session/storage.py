@@ -429,7 +429,7 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
     target = target.absolute()
     _check(target, mark, overwrite)
     try:
-        with working_folder(target.parent / f".{target.name}.making", target) as work:
+        with working_folder(_work_of(target), target) as work:
             _put_back(work, target)
             for stale in [path for path in work.iterdir() if path.is_dir() and path.name != key]:
                 remove_tree(stale)
@@ -468,11 +468,25 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:
-    """Return True if the target exists with this key, which its mark file states."""
+    """Return True if the target exists with this key, which its mark file states.
+
+    What a kill left of making it anew is removed, if nobody makes it just now.
+    """
     try:
-        return bool(read_json(target / mark).get("key") == key)
+        made = bool(read_json(target / mark).get("key") == key)
     except DataError:
         return False
+    work = _work_of(target)
+    with suppress(OSError, BusyError):
+        if made and work.is_dir():
+            with working_folder(work, target):
+                for left in [path for path in work.iterdir() if path.is_dir()]:
+                    remove_tree(left)
+    return made
+
+
+def _work_of(target: Path) -> Path:
+    return target.parent / f".{target.name}.making"
 
 
 def _check(target: Path, mark: str, overwrite: bool) -> None:
