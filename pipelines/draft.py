@@ -37,6 +37,7 @@ from pipelines.drafting.motion import TrackedPoints, explain_motion, explains_be
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
 from pipelines.formats.drone_logs.dji_subtitles import read_subtitles
+from pipelines.formats.drone_logs.place_tracks import AIRSIM
 from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
 from pipelines.formats.logs.maps import MAP_TYPES, frame_of
 from pipelines.formats.logs.messages import all_samples, header_ns, kind_of, samples
@@ -461,12 +462,24 @@ def _span(t_ns: Int64) -> TimeSpan:
 
 def _drone_logs(path: Path, place: NamePlace, format_: TelemetryFormat) -> Iterator[Proposal]:
     """Describe the poses in a drone's own log, with or without attitudes; those of each vehicle in it."""
-    vehicles = TLOG.vehicles(path) if format_.name == TLOG.name else []
+    vehicles: dict[int, str] = {}
+    if format_.name == TLOG.name:
+        vehicles = {number: f"vehicle{number}" for number in TLOG.vehicles(path)}
+    if format_.name == AIRSIM.name:
+        vehicles = AIRSIM.vehicles(path)
+        t_ns = AIRSIM.picture_times(path, TelemetryChoice())
+        about, labels = f"{len(t_ns)} times", tuple(map(label_of, vehicles.values()))
+        stamps = FoundFrames(
+            "frame_times", path, place, about, {"file": path}, labels, (0, place), _span(t_ns)
+        )
+        yield replace(stamps, frames=len(t_ns))
     for instance in vehicles if len(vehicles) > 1 else [None]:
-        yield _drone_log(path, place, format_, instance)
+        yield _drone_log(path, place, format_, instance, vehicles.get(instance or 0, ""))
 
 
-def _drone_log(path: Path, place: NamePlace, format_: TelemetryFormat, instance: int | None) -> FlownPoses:
+def _drone_log(
+    path: Path, place: NamePlace, format_: TelemetryFormat, instance: int | None, vehicle: str
+) -> FlownPoses:
     try:
         telemetry = format_.read_telemetry(path, TelemetryChoice(instance=instance))
     except DataError:  # if only heights are missing, reading with a stated height works
@@ -493,7 +506,7 @@ def _drone_log(path: Path, place: NamePlace, format_: TelemetryFormat, instance:
         place,
         f"{format_.title}, {len(track.t_ns)} positions, {has}, {span}",
         {"file": path} | ({} if instance is None else {"instance": instance}),
-        (label_of_place(place) if instance is None else label_of(f"vehicle{instance}"),),
+        (label_of_place(place) if instance is None else label_of(vehicle),),
         (0, int(not turned), place, instance or 0),
         span,
         of_body=held and not turned,

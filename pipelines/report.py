@@ -31,6 +31,7 @@ from pipelines.session.stages import (
     open_session,
     outdated,
     session_name,
+    tidy,
     versions_of,
     was_interrupted,
 )
@@ -107,6 +108,7 @@ def report(
     if not force and not was_interrupted(folder):
         page = _Page(open_session(folder), studied, video)
         if (done := page.session.finished(REPORT, page.settings, page.inputs)) is not None:
+            tidy(folder)
             return Reported(place, skipped=True, warnings=done.warnings)
     with locked(folder) as session:
         page = _Page(session, studied, video)

@@ -1,4 +1,4 @@
-"""Trajectories as text: TUM, CSV with a heading, and AirSim's recording.
+"""Trajectories as text: TUM, and CSV with a heading.
 
 TUM: `t x y z qx qy qz qw`, t in seconds; a line above the numbers may name another order, as `# timestamp tx
 ty tz qw qx qy qz`.
@@ -7,7 +7,7 @@ ty tz qw qx qy qz`.
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,6 @@ from pipelines.formats.common.rows import (
     stamp_column,
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import Recording, Trajectory
 from pipelines.session.storage import read_text
@@ -309,7 +308,12 @@ TUM_EXPORT = TumExport()
 
 
 def _is_csv(head: str) -> bool:
-    return find_poses(head) is not None and not _is_airsim(head)
+    return find_poses(head) is not None and not is_airsim(head)
+
+
+def is_airsim(head: str) -> bool:
+    """Test for a recording of AirSim, a drone's own log with axes of its own."""
+    return {"TimeStamp", "POS_X", "Q_W", "ImageFile"} <= set(head.partition("\n")[0].split())
 
 
 def _read_csv(path: Path) -> Trajectory:
@@ -360,20 +364,3 @@ def write_pose_csv(path: Path, trajectory: Trajectory) -> None:
 
 
 POSE_CSV = TrajectoryFile("csv", "poses as CSV", (".csv", ".txt", ".tsv"), _is_csv, _read_csv)
-
-
-# --- AirSim's own recording (airsim_rec.txt): world NED, body forward, right, down ---------------------
-
-
-def _is_airsim(head: str) -> bool:
-    return {"TimeStamp", "POS_X", "Q_W", "ImageFile"} <= set(head.partition("\n")[0].split())
-
-
-def _read_airsim(path: Path) -> Trajectory:
-    """Read every pose, turned to east, north, up and a body's forward, left, up."""
-    found = _read_csv(path)
-    turned = attitude_in_enu(found.quaternion_xyzw, relative_to="world", axes="ned")
-    return replace(found, position=found.position[:, [1, 0, 2]] * [1, 1, -1], quaternion_xyzw=turned)
-
-
-AIRSIM = TrajectoryFile("airsim", "AirSim recording", (".txt",), _is_airsim, _read_airsim)

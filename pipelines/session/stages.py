@@ -548,6 +548,13 @@ def was_interrupted(folder: Path) -> bool:
     )
 
 
+def tidy(folder: Path) -> None:
+    """Remove what a kill left of making a stage, if the session can be written."""
+    if any(_new_folder(folder, stage).exists() for stage in STAGES):
+        with suppress(MocapError), locked(folder):
+            pass
+
+
 def _drop_links(folder: Path) -> None:
     """Remove symbolic links in the places of hidden and unfinished folders; see `drop_link`."""
     partial = folder / ".partial"

@@ -227,8 +227,6 @@ class FlightPoses:
         title = self._files.format_of("pose", pose).title
         if pose.attitude and not is_log and (self.is_still(camera) or not pose.by_pictures):
             yield f"pose: attitude: no option of this file ({title})", "leave it out"
-        if self._files.format_of("pose", pose).name == "airsim" and pose.axes:
-            yield f"pose: axes: a file of this kind ({title}) states its own", "leave them out"
         if self.is_still(camera):
             if pose.of == "body" or camera.is_carried:
                 yield "pose: a still camera's pose is its own", "leave `of: body` and the mount out"

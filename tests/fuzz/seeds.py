@@ -124,6 +124,7 @@ SEEDS: dict[str, Writer] = {
         "VehicleName\tTimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\tImageFile\n"
         + "".join(f"Drone1\t17000000000{k}0\t1\t2\t-34\t1\t0\t0\t0\ta.png\n" for k in range(9)),
     ),
+    "airsim_settings": _text("settings.json", test_anipose_toml.AIRSIM),
     "alphapose": _keypoints("alphapose"),
     "anipose": _text("calib.toml", test_anipose_toml.CAMERA),
     "ardupilot": lambda folder: drone_logs.write_dataflash(folder / "a.bin", _truth(folder)),

@@ -20,7 +20,7 @@ from pipelines.formats.common.files import TextFormat, numbers, read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
-from pipelines.session.storage import bad_value, damaged, empty, read_text
+from pipelines.session.storage import AGAIN, bad_value, damaged, empty, read_json, read_text
 
 Cameras = dict[str, CalibratedCamera]
 
@@ -569,3 +569,64 @@ KALIBR = CalibrationFile(
     lambda head: _has_keys(head, (r"cam\d+", "camera_model")),
     _read_kalibr,
 )
+
+
+# --- AirSim's settings.json: cameras by field of view -------------------------------------------------------
+
+# What the simulator takes where nothing is stated (its documentation of settings).
+_AIRSIM_PICTURE = {"Width": 256, "Height": 144, "FOV_Degrees": 90}
+
+
+def _is_airsim(head: str) -> bool:
+    return '"SettingsVersion"' in head and '"SimMode"' in head
+
+
+def _read_airsim(path: Path) -> Cameras:
+    """Read `CameraDefaults`, and the cameras of vehicles as "vehicle/camera", with the mount as a note."""
+    settings = read_json(path, AGAIN)
+    blocks = {"CameraDefaults": settings.get("CameraDefaults", {})}
+    for vehicle, stated in _mapping(path, settings.get("Vehicles", {})).items():
+        for camera, block in _mapping(path, _mapping(path, stated).get("Cameras", {})).items():
+            blocks[f"{vehicle}/{camera}"] = block
+    defaults = _scene_of_airsim(path, blocks["CameraDefaults"])
+    return {
+        name: _airsim_camera(path, name, _mapping(path, block), defaults) for name, block in blocks.items()
+    }
+
+
+def _mapping(path: Path, value: object) -> dict[str, object]:
+    if not isinstance(value, dict):
+        raise bad_value(path, "holds a value in place of names and values")
+    return value
+
+
+def _scene_of_airsim(path: Path, block: object) -> dict[str, object]:
+    """Return the settings of pictures as the eye sees them, which are of type 0."""
+    every = _mapping(path, block).get("CaptureSettings", [])
+    captured = [_mapping(path, each) for each in (every if isinstance(every, list) else [])]
+    return next((each for each in captured if each.get("ImageType", 0) == 0), {})
+
+
+def _airsim_camera(
+    path: Path, name: str, block: Mapping[str, object], defaults: Mapping[str, object]
+) -> CalibratedCamera:
+    stated = {**_AIRSIM_PICTURE, **defaults, **_scene_of_airsim(path, block)}
+    width, height, fov_deg = numbers(path, name, [stated[key] for key in _AIRSIM_PICTURE])
+    if not 0 < fov_deg < 180:
+        raise bad_value(path, f"camera {name} has a field of view of {fov_deg:g} deg")
+    focal_px = width / 2 / np.tan(np.radians(fov_deg) / 2)
+    matrix = _matrix_of(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    lens = intrinsics(path, name, size=[width, height], matrix=matrix, distortion=[], fisheye=False)
+    keys = ("X", "Y", "Z", "Pitch", "Roll", "Yaw")
+    x, y, z, pitch, roll, yaw = numbers(path, name, [block.get(key, 0.0) for key in keys]).tolist()
+    note = ""
+    if any(key in block for key in keys):
+        arm = f"[{x:g}, {0 - y:g}, {0 - z:g}]"
+        note = (
+            f"sits on its vehicle as mount: {{looks: forward, down_deg: {0 - pitch:g}, translation: {arm}}}"
+        )
+        note += f", turned by yaw {yaw:g} and roll {roll:g} deg" if yaw or roll else ""
+    return CalibratedCamera(lens, note=note)
+
+
+AIRSIM = CalibrationFile("airsim_settings", "AirSim settings", (".json",), _is_airsim, _read_airsim)

@@ -1,4 +1,4 @@
-"""Places over time without attitudes: GPX tracks, and tables with latitude and longitude or x, y and z."""
+"""Tables of drones: places without attitudes (GPX, CSV), and the recordings of AirSim."""
 
 import re
 from collections.abc import Callable
@@ -10,8 +10,10 @@ import numpy as np
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import Heading, describe_times, find_heading, parse_stamps, rows_below
 from pipelines.formats.drone_logs.dji_records import FORMAT as DJI_RECORD
-from pipelines.formats.drone_logs.telemetry_rows import position_track
+from pipelines.formats.drone_logs.telemetry_rows import DroneLog, attitude_track, position_track
+from pipelines.formats.poses import POSITION, QUATERNION, find_poses, is_airsim
 from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice
@@ -124,3 +126,64 @@ GPX = PlaceTrack("gpx", "GPX track", (".gpx",), lambda head: "<gpx" in head, _re
 PLACES_CSV = PlaceTrack(
     "places", "places as CSV", (".csv", ".txt", ".tsv"), lambda head: _columns(head) is not None, _read_table
 )
+
+
+class AirsimRecording(DroneLog):
+    """Reader of AirSim's recordings (airsim_rec.txt) of one or several vehicles: in NED, bodies in FRD."""
+
+    name = "airsim"
+    title = "AirSim recording"
+    suffixes: tuple[str, ...] = (".txt",)
+    choices: tuple[str, ...] = ("instance",)
+
+    def recognises(self, path: Path) -> bool:
+        """Return True if its heading is that of AirSim."""
+        return is_airsim(read_head(path, self.suffixes))
+
+    def vehicles(self, path: Path) -> dict[int, str]:
+        """Return the names of the vehicles by their numbers, in the order of appearance."""
+        return dict(enumerate(dict.fromkeys(_airsim_rows(path)[0])))
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Read one vehicle; `instance` is its number, from 0 in the order of appearance."""
+        names, t_ns, values, dropped = _airsim_rows(path)
+        vehicles = dict.fromkeys(names)
+        numbered = dict(enumerate(vehicles))
+        if len(vehicles) > 1 and choice.instance is None:
+            problem = f"holds {len(vehicles)} vehicles ({', '.join(vehicles)})"
+            raise DataError(path, problem, "say which with `instance:`, from 0", code="ambiguous")
+        if (choice.instance or 0) not in numbered:
+            problem = f"has no vehicle {choice.instance}"
+            raise DataError(path, problem, f"there are 0 to {len(vehicles) - 1}", code="no-such-name")
+        name = numbered[choice.instance or 0]
+        own = np.array([each == name for each in names])
+        t_ns, values = t_ns[own], values[own]
+        enu = values[:, [1, 0, 2]] * [1, 1, -1]
+        turned = attitude_in_enu(values[:, 3:], relative_to="world", axes="ned")
+        position = position_track(path, name, t_ns, enu, dropped, on_earth=False)
+        body = attitude_track(name, t_ns, turned, dropped)
+        return Telemetry(position, body, None, "the simulator's clock", dropped=dropped)
+
+    def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:  # noqa: ARG002  # alike for all
+        """Read the times at which all vehicles were filmed, ns [N]."""
+        return np.unique(_airsim_rows(path)[1])
+
+
+def _airsim_rows(path: Path) -> tuple[list[str], Int64, Float, dict[str, int]]:
+    """Read the vehicle, the time and the pose of each row that has a time; also return losses by cause."""
+    text = read_text(path)
+    found = find_poses(text)
+    if found is None:
+        raise DataError(path, "has no heading of AirSim", "record it again", code="missing-column")
+    heading, columns = found
+    named = {"vehicle": heading.names["vehiclename"]} if "vehiclename" in heading.names else {}
+    table = rows_below(path, heading, text, named, columns)
+    t_ns, timed = parse_stamps(path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated)
+    names = table.text["vehicle"].to_pylist() if named else ["vehicle"] * len(t_ns)
+    lost = {"truncated last line": table.truncated, "no time": int((~timed).sum())}
+    values = table.stack((*POSITION, *QUATERNION))[timed]
+    names = [str(name) for name, known in zip(names, timed, strict=True) if known]
+    return names, t_ns[timed], values, {cause: count for cause, count in lost.items() if count}
+
+
+AIRSIM = AirsimRecording()

@@ -219,8 +219,8 @@ PLY = CloudFile(
 # Points that the file marks as noise (classes 7 and 18) or as withheld are left out and counted. Coordinates
 # are those of the file's reference system: usually a map projection, which the file may name.
 
-# So many points are read at a time, which takes some 100 MB.
-_CHUNK = 1_000_000
+# So many bytes of points are read at a time, which with their coordinates takes some 100 MB.
+_CHUNK_BYTES = 30_000_000
 _NOISE = (7, 18)  # low and high noise of ASPRS
 _GEO_KEYS = (3072, 2048)  # GeoTIFF: the projected, or else the geographic system's EPSG number
 # A variable length record of LAS has at least this many bytes.
@@ -279,10 +279,13 @@ def _add_points(path: Path, header: Any, voxels: VoxelSet) -> dict[str, int]:
     if not header.are_points_compressed:
         room = path.stat().st_size - header.offset_to_point_data
         there = max(0, min(stated, room // header.point_format.size))
+    chunk_points = max(1, _CHUNK_BYTES // header.point_format.size)
     try:
+        if header.are_points_compressed:
+            _refuse_damaged_chunks(path, header)
         # In one thread: threads of the decompressor do not survive a fork.
         with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as cloud:
-            while read < there and len(chunk := cloud.read_points(min(_CHUNK, there - read))):
+            while read < there and len(chunk := cloud.read_points(min(chunk_points, there - read))):
                 read += len(chunk)
                 bad = np.isin(np.asarray(chunk.classification), _NOISE)
                 hidden = np.asarray(chunk.withheld).astype(bool) & ~bad
@@ -298,6 +301,39 @@ def _add_points(path: Path, header: Any, voxels: VoxelSet) -> dict[str, int]:
             raise damaged(path, f"laspy cannot read it ({str(error)[:100]})") from error
     lost["points cut off"] = stated - read
     return dict(+lost)
+
+
+# Layers of an item of point formats 6 to 10 by its number (LASzip); of extra bytes, one for each byte.
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+
+
+def _refuse_damaged_chunks(path: Path, header: Any) -> None:
+    """Refuse a LAZ whose chunks or their layers are larger than it: lazrs takes memory for them or aborts."""
+    lazrs, size = need("lazrs", "las"), path.stat().st_size
+    record = next(vlr.record_data for vlr in header.vlrs if type(vlr).__name__ == "LasZipVlr")
+    items = np.frombuffer(record[34:], "<u2").reshape(-1, 3)[:, :2].tolist()
+    layers = sum(_LAYERS.get(kind, width) for kind, width in items) if items[0][0] in _LAYERS else 0
+    first = header.offset_to_point_data
+
+    def number_at(place: int) -> int:
+        file.seek(place)
+        return int.from_bytes(file.read(8), "little", signed=True)
+
+    with path.open("rb") as file:
+        table = number_at(first)
+        # A writer that cannot go back puts the place of the table at the end.
+        table = number_at(size - 8) if table < 0 else table
+        stated = (number_at(table) >> 32 & 0xFFFFFFFF) * header.point_format.size
+        place = first + 8
+        file.seek(first)
+        chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record)) if stated <= size else []
+        for _, length in chunks or [(0, 0)]:
+            file.seek(place + header.point_format.size + 4)
+            sizes = np.frombuffer(file.read(4 * layers), "<u4")
+            stated = max(stated, place - first + length, int(sizes.sum()))
+            place += length
+    if stated > size:
+        raise damaged(path, f"states chunks of {stated} bytes in {size}")
 
 
 def crs_of(header: Any) -> str | None:

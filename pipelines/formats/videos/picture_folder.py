@@ -19,6 +19,8 @@ from pipelines.session.records import SHARED_SECONDS, UNTIMED, Telemetry, VideoI
 from pipelines.session.registries import TelemetryChoice
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
+# Vehicle, camera and kind of picture, and the time.
+_OF_AIRSIM = re.compile(r"img_(.+)_\d{12,}")
 # Cameras write XMP into the first part of a file of this size.
 _HEAD = 512 * 1024
 # EXIF counts whole seconds.
@@ -218,6 +220,10 @@ class FolderPictures:
         if not self.files:
             problem = "is no folder of pictures"
             raise DataError(path, problem, "name the folder that holds them", code="wrong-kind")
+        named = [_OF_AIRSIM.fullmatch(file.stem) for file in self.files]
+        if len(cameras := sorted({match[1] for match in named if match})) > 1:
+            problem = f"holds pictures of {len(cameras)} cameras of AirSim ({', '.join(cameras)})"
+            raise DataError(path, problem, "give each a folder of its own", code="ambiguous")
         self._size: tuple[int, ...] | None = None
 
     def __enter__(self) -> Self:

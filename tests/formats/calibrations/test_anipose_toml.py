@@ -28,6 +28,13 @@ translation = [1, 2, 3]
 """
 
 
+AIRSIM = """{"SettingsVersion": 1.2, "SimMode": "Multirotor",
+ "CameraDefaults": {"CaptureSettings": [{"ImageType": 5, "Width": 9}, {"ImageType": 0, "FOV_Degrees": 120}]},
+ "Vehicles": {"D1": {"Cameras": {"front": {"CaptureSettings":
+  [{"Width": 640, "Height": 480, "FOV_Degrees": 90}],
+  "X": 0.5, "Y": 0.25, "Z": 0.125, "Pitch": -15}}}}}"""
+
+
 def write(folder: Path, text: str) -> Path:
     path = folder / "calib.toml"
     path.write_text(text)
@@ -93,3 +100,23 @@ def test_faulty_content_is_refused(tmp_path: Path, old: str, new: str) -> None:
     assert old in CAMERA
     with pytest.raises(DataError):
         READER.read_calibration(write(tmp_path, CAMERA.replace(old, new, 1)))
+
+
+def test_settings_of_airsim_give_lenses_by_their_field_of_view(tmp_path: Path) -> None:
+    path = tmp_path / "settings.json"
+    path.write_text(AIRSIM, encoding="utf-8")
+    cameras = calibration_files.AIRSIM.read_calibration(path)
+    for name, width, height, focal_px in (
+        ("D1/front", 640, 480, 320),
+        ("CameraDefaults", 256, 144, 128 / 3**0.5),
+    ):
+        lens = cameras[name].intrinsics
+        assert lens is not None
+        assert (lens.width, lens.height, lens.cx, lens.cy) == (
+            width,
+            height,
+            (width - 1) / 2,
+            (height - 1) / 2,
+        )
+        assert (lens.fx, lens.fy) == pytest.approx((focal_px, focal_px))
+    assert "down_deg: 15, translation: [0.5, -0.25, -0.125]" in cameras["D1/front"].note

@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.drone_logs.place_tracks import GPX, PLACES_CSV
+from pipelines.formats.drone_logs.place_tracks import AIRSIM, GPX, PLACES_CSV
 from pipelines.formats.drone_logs.tlog import FORMAT as TLOG
+from pipelines.geometry.poses import rotate
+from pipelines.session.errors import DataError
 from pipelines.session.recognition import recognise
 from pipelines.session.registries import TelemetryChoice, TelemetryFormat
 from tests.real_data import real_data
@@ -80,3 +82,23 @@ def test_a_track_by_pymavlink_is_read(tmp_path: Path) -> None:
     assert listed.count("<trkpt") >= len(found) > 100
     apart = np.abs(ours[None, :, :2] - found[:, None, :2]).max(axis=2).min(axis=1)
     assert np.median(apart) < 1e-6
+
+
+def test_airsims_recording_is_turned_to_east_north_up(tmp_path: Path) -> None:
+    """Two drones 34 m above the ground that head 90 deg, to the east, and look level."""
+    half, path = 0.5**0.5, tmp_path / "airsim_rec.txt"
+    rows = ["VehicleName TimeStamp POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile"]
+    for k in range(2):
+        pose = f"{1_700_000_000_000 + 40 * k} {1 + k} 2.0 -34 {half} 0 0 {half}"
+        rows += [f"Drone1 {pose} a.png", f"Drone2 {pose.replace(' 2.0 ', ' 7 ')} b.png"]
+    path.write_text("\n".join(rows).replace(" ", "\t") + "\n", encoding="utf-8")
+    assert recognise(path, TelemetryFormat, "log") is AIRSIM
+    with pytest.raises(DataError, match="Drone1, Drone2"):
+        AIRSIM.read_telemetry(path, TelemetryChoice())
+    for instance, east_m in ((0, 2), (1, 7)):
+        found = AIRSIM.read_telemetry(path, TelemetryChoice(instance=instance))
+        np.testing.assert_allclose(found.position.values, [[east_m, 1, 34], [east_m, 2, 34]])
+        assert found.body is not None
+        ahead, up = (rotate(found.body.quaternion_xyzw[0], axis) for axis in (np.eye(3)[0], np.eye(3)[2]))
+        np.testing.assert_allclose([ahead, up], [[1, 0, 0], [0, 0, 1]], atol=1e-9)
+    assert np.diff(AIRSIM.picture_times(path, TelemetryChoice())).tolist() == [40_000_000]

@@ -9,8 +9,6 @@ import pytest
 from hypothesis import given
 
 from pipelines.formats import poses as trajectory_files
-from pipelines.geometry.poses import rotate
-from pipelines.session.recognition import recognise
 from pipelines.session.records import Trajectory
 from pipelines.session.registries import Export, TrajectoryFormat
 from tests.formats.exported import flown, recording
@@ -163,19 +161,3 @@ def test_vins_writes_w_first(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.quaternion_xyzw[0], np.array([0.1, 0.7, 0.5, 0.5]))
     (tmp_path / "vio.csv").write_text(f"1700000000.25 {numbers}\n")
     np.testing.assert_allclose(READER.read_trajectory(tmp_path / "vio.csv").quaternion_xyzw[0], turned)
-
-
-def test_airsims_recording_is_turned_to_east_north_up(tmp_path: Path) -> None:
-    """A drone 34 m above the ground that heads 90 deg, to the east, and looks level."""
-    heading = "VehicleName TimeStamp POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile"
-    half = 0.5**0.5
-    rows = [["Drone1", 1_700_000_000_000 + 40 * k, 1 + k, 2, -34, half, 0, 0, half, "a.png"] for k in (0, 1)]
-    path = tmp_path / "airsim_rec.txt"
-    path.write_text("\n".join("\t".join(map(str, row)) for row in (heading.split(), *rows)) + "\n")
-    reader = recognise(path, TrajectoryFormat, "trajectory")
-    assert reader.name == "airsim"
-    found = reader.read_trajectory(path)
-    assert np.diff(found.t_ns).tolist() == [40_000_000]
-    np.testing.assert_allclose(found.position, [[2, 1, 34], [2, 2, 34]])
-    np.testing.assert_allclose(rotate(found.quaternion_xyzw[0], np.array([1.0, 0, 0])), [1, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(rotate(found.quaternion_xyzw[0], np.array([0, 0, 1.0])), [0, 0, 1], atol=1e-9)
