@@ -127,7 +127,7 @@ def replan_compare_command(
     if shown.as_json:
         return result.metrics if figures is None else result.metrics | {"filmed": figures}
     if not shown.quiet:
-        _print(result.metrics)
+        _print(result.metrics, filmed=figures is not None)
         if figures is not None:
             _print_filmed(figures)
     place = result.folder / "replan"
@@ -137,7 +137,9 @@ def replan_compare_command(
     return None
 
 
-def _print(metrics: dict[str, Any]) -> None:
+def _print(metrics: dict[str, Any], *, filmed: bool) -> None:
+    from pipelines.planning.comparison import outcome
+
     arms = {name: metrics["arms"][name] for group in metrics["equal_ranges"] for name in group["arms"]}
     _print_rows(
         [
@@ -167,10 +169,10 @@ def _print(metrics: dict[str, Any]) -> None:
             for name, one in scores.get("by_person", {}).items()
         ]
     )
-    say(metrics["verdict"])
+    say(f"modelled: {metrics['verdict']}" if filmed else metrics["verdict"])
     for group in metrics["equal_ranges"] if len(metrics["equal_ranges"]) > 1 else ():
         if group["best"] is not None:
-            say(f"of equal range ({', '.join(group['arms'])}): {' and '.join(group['best']['arms'])}")
+            say(f"of equal range ({', '.join(group['arms'])}): {outcome(group['best'])}")
 
 
 def _print_rows(rows: list[dict[str, object]]) -> None:
@@ -179,19 +181,16 @@ def _print_rows(rows: list[dict[str, object]]) -> None:
 
 
 def _errors(stated: dict[str, Any]) -> dict[str, object]:
-    share, error, coverage = (stated.get(key) or {} for key in ("pck150", "mpjpe_mm", "coverage"))
-    return {
-        "PCK150 %": _with_interval(share, 100),
-        "MPJPE mm": _with_interval(error, 1),
-        "covered %": _percent(coverage.get("mean")),
-    }
+    scales = {"PCK150 %": ("pck150", 100), "MPJPE mm": ("mpjpe_mm", 1), "covered %": ("coverage", 100)}
+    return {title: _with_interval(stated.get(key) or {}, scale) for title, (key, scale) in scales.items()}
 
 
 def _with_interval(stated: dict[str, Any], scale: float) -> str | None:
+    """Return a mean and half of its interval, which lies about it evenly."""
     if not stated:
         return None
     low, high = stated["interval"] or (None, None)
-    ends = "" if low is None or high is None else f" [{scale * low:.1f}, {scale * high:.1f}]"
+    ends = "" if low is None or high is None else f" ±{scale * (high - low) / 2:.1f}"
     return f"{scale * stated['mean']:.1f}{ends}"
 
 
@@ -203,18 +202,11 @@ def _print_filmed(metrics: dict[str, Any]) -> None:
             {
                 "arm": name,
                 "pictures": arm["pictures"],
-                "tilt deg": arm["tilt_deg"]["mean"],
+                "tilt": arm["tilt_deg"]["mean"],
                 "max": arm["tilt_deg"]["max"],
-                "within 5 deg %": 100 * arm["tilt_deg"]["within_5_share"],
-                "in view %": 100 * arm["in_view_share"],
                 "detected %": 100 * arm["detected_share"],
-                "PCK %": _percent(arm["keypoint_pck"]),
-                "keypoint px": arm["keypoint_median_px"],
-                "reprojection px": None if arm["reprojection_px"] is None else arm["reprojection_px"]["mean"],
-                "measured %": _percent(arm["reconstructed_share"]),
-                "MPJPE mm": arm["mpjpe_mm"],
-                "in common mm": arm.get("common_mpjpe_mm"),
-                "PCK150 %": _percent(arm["pck150"]),
+                "PCK %": None if arm["keypoint_pck"] is None else 100 * arm["keypoint_pck"],
+                **_errors(arm.get("reconstruction_error", {})),
             }
             for of_arm, over_all in metrics["arms"].items()
             for name, arm in (
@@ -223,7 +215,4 @@ def _print_filmed(metrics: dict[str, Any]) -> None:
             )
         ]
     )
-
-
-def _percent(share: float | None) -> float | None:
-    return None if share is None else 100 * share
+    say(metrics["verdict"])

@@ -36,7 +36,8 @@ def study_command(
     seed.
 
     On a session, planner arms fly again against the log. Variables: arm, range_m, tilt_deg, robots, every
-    setting of the planner. With a single value: config (PLANNER.yaml), pose_noise, trials, seed.
+    setting of the planner, actor: a number of other walks by chance, or walks like speed:0.8+delay:2+turn:30
+    between commas. With a single value: config (PLANNER.yaml), pose_noise, trials, seed.
     """  # noqa: D301  # click keeps the lines of a paragraph that begins with the character \b
     from pipelines.reporting.studies import setting, tables
     from pipelines.session.urls import session_here

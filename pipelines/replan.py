@@ -25,6 +25,7 @@ from pipelines.planning.replay import (
     FLOWN,
     LOGGED,
     PLANNED,
+    MeasuredJoints,
     flight_from,
     fly_arm,
     logged_arm,
@@ -32,6 +33,7 @@ from pipelines.planning.replay import (
     trajectories,
 )
 from pipelines.planning.scene import (
+    PICTURES_HZ,
     LoggedFlight,
     ReplanSettings,
     ReplayScene,
@@ -59,7 +61,7 @@ from pipelines.simulation.detector_errors import (
 )
 from pipelines.simulation.scenario import DetectorErrors
 
-REPLAN_STAGE = Stage("replan", revision=8)
+REPLAN_STAGE = Stage("replan", revision=9)
 
 # The detector's errors were measured by the size of a person of this height in the picture.
 PERSON_HEIGHT_M = 1.75
@@ -153,7 +155,9 @@ def replan(
             "kept": kept,
             "moments": len(scene.t_ns),
             "pictures": len(scene.t_ns[scene.pictures]),
-            "joint_frames": {name: result.joint_frames for name, result in results.items()},
+            "joint_frames": {
+                name: read_json(place / "facts.json")["joint_frames"] for name, place in made.items()
+            },
             "safety": {name: result.flight.safety for name, result in results.items()},
         }
         record = run.publish(counts=counts, warnings=metrics["warnings"])
@@ -296,7 +300,9 @@ def detect_by_model(
 ) -> tuple[Float, Float]:
     """Simulate the detector by a model with tilt and distance (`replay.Detect`)."""
     tilt_deg, height_px = view_of(camera, target, height_m=PERSON_HEIGHT_M, focal_px=focal_px)
-    return detect_keypoints(pixels, free, tilt_deg, height_px, errors, rng, joints=joints)
+    return detect_keypoints(
+        pixels, free, tilt_deg, height_px, errors, rng, joints=joints, rate_hz=PICTURES_HZ
+    )
 
 
 def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder: Path) -> None:
@@ -323,8 +329,7 @@ def read_result(folder: Path) -> ArmResult:
         flight=flight_from(
             table, np.load(folder / "aim.npy"), np.load(folder / "known.npy"), facts["safety"]
         ),
-        error_m=np.load(errors, mmap_mode="r") if errors.exists() else None,  # large in long flights
-        joint_frames=facts["joint_frames"],
+        measured=MeasuredJoints(np.load(errors), facts["joint_frames"]) if errors.exists() else None,
     )
 
 

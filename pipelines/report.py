@@ -282,7 +282,10 @@ def _refuse_foreign(page: Path, overwrite: bool) -> None:
 
 def _finished_stages(session: Session) -> dict[str, StageRecord]:
     records = {"ingest": session.ingested()}
-    others = {name: session.intact_record(name) for name in ("detect", "reconstruct", "replan")}
+    others = {name: session.intact_record(name) for name in ("detect", "reconstruct", "replan", "film")}
+    replan, film = others["replan"], others["film"]
+    if replan is None or film is None or film.inputs["replan"] != replan.key:
+        del others["film"]  # of another comparison
     return records | {name: record for name, record in others.items() if record is not None}
 
 
@@ -413,7 +416,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         frames={name: shown.frames(name) for name in description.cameras},
         keypoints={name: shown.keypoints(stage, name) for name, stage in found_by.items()},
         stages={name: asdict(record) for name, record in records.items()},
-        replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
+        replan=_load_replan(folder, records, maps) if "replan" in records else None,
         refined=_by_camera(shown, "reconstruct/cameras.parquet", records.get("reconstruct")),
         angles=shown.table(angles, ANGLES) if angles in outputs else None,
         joint_errors=read_table(folder / errors, JOINT_ERRORS) if errors in outputs else None,
@@ -432,8 +435,8 @@ def _by_camera(shown: _Shown, name: str, record: StageRecord | None) -> dict[str
     return {str(name): own[POSES.names].reset_index(drop=True) for name, own in table.groupby("camera")}
 
 
-def _load_replan(folder: Path, record: StageRecord, maps: list[Occupancy]) -> ReplanContent:
-    place = folder / "replan"
+def _load_replan(folder: Path, records: dict[str, StageRecord], maps: list[Occupancy]) -> ReplanContent:
+    place, record = folder / "replan", records["replan"]
     metrics = read_json(place / "metrics.json")
     return ReplanContent(
         metrics=metrics,
@@ -444,4 +447,5 @@ def _load_replan(folder: Path, record: StageRecord, maps: list[Occupancy]) -> Re
         },
         actor=read_table(place / "actor.parquet", ACTOR),
         map=max(maps, key=lambda one: one.from_ns, default=None),
+        filmed=read_json(folder / "film" / "metrics.json") if "film" in records else {},
     )

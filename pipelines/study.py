@@ -7,6 +7,7 @@ flies planner arms against its log with other settings, with the same draws. All
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
@@ -19,9 +20,25 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Views, triangulate
-from pipelines.planning.comparison import SMALLEST_DIFFERENCE_MM, capped_mm, compare, mean_of_trials
+from pipelines.planning.comparison import (
+    SMALLEST_DIFFERENCE_MM,
+    capped_mm,
+    compare,
+    few_trials,
+    figures_of,
+    mean_of_trials,
+    worth_flying,
+)
 from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config
-from pipelines.planning.scene import ReplanSettings, ReplayScene, build_scene, load_flight
+from pipelines.planning.scene import (
+    LoggedFlight,
+    OtherWalk,
+    ReplanSettings,
+    ReplayScene,
+    build_scene,
+    load_flight,
+    walked_otherwise,
+)
 from pipelines.reconstruction.refining import refined_points
 from pipelines.replan import (
     detector_errors,
@@ -37,6 +54,7 @@ from pipelines.reporting.studies import Row, draw, estimates, rows_csv
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
+from pipelines.session.records import Occupancy
 from pipelines.session.stages import locked
 from pipelines.session.storage import (
     STUDY_MARK,
@@ -73,12 +91,22 @@ from pipelines.simulation.walks import (
 )
 
 # It is raised whenever the same study gives other figures than before.
-_REVISION = 7
+_REVISION = 8
 # A study with more combinations would take days.
 _MAX_CELLS = 500
 _RANGE = re.compile(r"(-?[0-9.]+):(-?[0-9.]+):([0-9.]+)")
+_MEASURED = (
+    *("capped_mm", "mpjpe_mm", "pck150", "coverage", "mean_range_m", "mean_tilt_deg", "hidden_share"),
+    *("blind_s", "path_m", "energy_kj", "min_clearance_m", "min_separation_m", "min_actor_distance_m"),
+    *("violations", "low_mm", "high_mm"),
+)
+"""Figures of a combination, in the rows of a study of a session."""
 _UNDIVIDED = ("config",)  # variables whose value may hold commas
-_OF_SESSION = ("arm", "robots", "range_m", "tilt_deg", "config", "trials", "seed", "pose_noise")
+_OF_SESSION = ("arm", "robots", "range_m", "tilt_deg", "actor", "config", "trials", "seed", "pose_noise")
+# People walk up to a third slower or faster than usual, stand a while, and turn where they please.
+_SPEEDS, _MOST_DELAY_S, _MOST_TURN_DEG = (0.7, 1.4), 3.0, 60.0
+# A way that is turned into obstacles so often is not turned at all.
+_MOST_TRIES = 50
 _SETTINGS = {"range_m": "radius_m", "tilt_deg": "tilt_deg"}  # variables with the names of planner settings
 
 Stated = Mapping[str, tuple[str, ...]]
@@ -342,39 +370,140 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
             maps = load_maps(place) if description.map else []
             scenes: dict[str, ReplayScene] = {}
             progress.start("Replaying", len(cells))
-            rows, capped = [], []
+            walks = _walks(stated, flight, maps)
+            rows, capped, places = [], [], []
             for k, cell in enumerate(cells):
                 own = replace(settings, planner=_planner_of(settings.planner, cell))
                 # Distance, tilt and number change nothing that the replays share.
                 shared = {name: cell[name] for name in cell if name not in ("arm", "robots", *_SETTINGS)}
                 name = hash_of(shared)
                 if name not in scenes:
-                    scenes[name] = build_scene(flight, maps, description, own, errors=model)
+                    walked = walks[shared["actor"]] if "actor" in shared else flight
+                    scenes[name] = build_scene(walked, maps, description, own, errors=model)
                 scene = _scene_of(scenes[name], cell)
                 flown = making.part(f"cell-{k:04d}", partial(fly_and_measure, scene, errors, _arm_of(cell)))
+                places.append(flown)
                 result = read_result(flown)
-                if result.error_m is None:
+                if result.measured is None:
                     raise _no_skeleton(place)
-                capped.append(capped_mm(result.error_m, result.joint_frames))
+                capped.append(capped_mm(result.measured))
                 arm = _arm_of(cell)
                 scores = compare(scene, {arm: result})["arms"][arm]
                 rows.append(_figures(scene, cell, scores, capped[-1]))
                 progress.advance()
+            every = rows
+            if len(walks) > 1:
+                groups = _by_combination(rows)
+                rows = [_over_walks([every[k] for k in own]) for own in groups]
+                capped = [np.array([capped[k].mean() for k in own]) for own in groups]
             best = _mark_tradeoff(rows, capped)
+            if len(walks) > 1:
+                by_walk = [[places[k] for k in own] for own in groups]
+                best["walks"] = [_count_walks(by_walk[best["cell"]], own) for own in by_walk]
             metrics = {
                 "kind": "session",
-                "varied": list(varied),
+                "varied": [name for name in varied if name != "actor"],
+                "walks": len(walks),
                 "trials": settings.trials,
                 "seed": settings.seed,
                 "keypoints": f"modelled after {errors.detector}",
                 "best": best,
                 "cells": rows,
                 "verdict": _verdict(rows, best),
-                "warnings": list(flight.warnings),
+                "warnings": [*flight.warnings, *few_trials(settings.trials)],
             }
-            return metrics, rows
+            return metrics, every
 
         return store(ingredients, produce)
+
+
+def _walks(stated: Stated, flight: LoggedFlight, maps: Sequence[Occupancy]) -> dict[str, LoggedFlight]:
+    """Return the flights of the walks that `actor` asks for, by the names of the walks.
+
+    A number is so many walks: the logged one, and others by chance. Else each value is one, for example
+    `speed:0.8+delay:2+turn:-30`. DataError: a value cannot be read, or a way is turned into an obstacle.
+    """
+    texts = stated.get("actor", ())
+    if len(texts) != 1 or not texts[0].isdigit():
+        return {text: walked_otherwise(flight, _walk_of(text), maps) for text in texts}
+    walks = {_walk_name(0): flight}
+    seed = _whole(stated, "seed", 0, 2**32 - 1, 0)
+    for k in range(1, len(_walk_names(texts))):
+        rng = np.random.default_rng([seed, k])
+        for tries in range(_MOST_TRIES):
+            turn_deg = rng.uniform(-_MOST_TURN_DEG, _MOST_TURN_DEG) if tries < _MOST_TRIES - 1 else 0.0
+            walk = OtherWalk(
+                float(np.exp(rng.uniform(*np.log(_SPEEDS)))),
+                float(rng.uniform(0.0, _MOST_DELAY_S)),
+                float(turn_deg),
+                float(rng.uniform(0.2, 0.8)),
+            )
+            with suppress(DataError):
+                walks[_walk_name(k)] = walked_otherwise(flight, walk, maps)
+                break
+    return walks
+
+
+def _walk_name(number: int) -> str:
+    return f"walk {number}"
+
+
+def _walk_names(texts: Sequence[str]) -> Sequence[str]:
+    """Return the names of the walks that `actor` asks for."""
+    if len(texts) == 1 and texts[0].isdigit():
+        (number,) = numbers({"actor": texts}, "actor", int, 1, _MAX_CELLS)
+        return [_walk_name(k) for k in range(number)]
+    for text in texts:
+        _walk_of(text)
+    return texts
+
+
+def _walk_of(text: str) -> OtherWalk:
+    """Read a walk like `speed:0.8+delay:2+turn:30`; `logged` is the walk of the log."""
+    limits = {"speed": (0.2, 5.0), "delay": (0.0, 60.0), "turn": (-180.0, 180.0)}
+    found = {}
+    for part in text.split("+") if text != "logged" else ():
+        name, _, value = part.partition(":")
+        if name not in limits:
+            remedy = "write a number of walks, or logged, speed:0.8, delay:2, turn:-30, joined by +"
+            raise DataError(
+                f"actor={text}", f"{part!r} is no variation of a walk", remedy, code="no-such-name"
+            )
+        (found[name],) = numbers({name: [value]}, name, float, *limits[name])
+    return OtherWalk(found.get("speed", 1.0), found.get("delay", 0.0), found.get("turn", 0.0))
+
+
+def _by_combination(rows: Sequence[Row]) -> list[list[int]]:
+    """Group rows that differ by their walks alone."""
+    groups: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        settings = {name: row[name] for name in row if name not in (*_MEASURED, "actor")}
+        groups.setdefault(hash_of(settings), []).append(k)
+    return list(groups.values())
+
+
+def _over_walks(rows: Sequence[Row]) -> Row:
+    """Average the rows of one combination over the walks; the interval of the error is over them, too."""
+    row = {name: value for name, value in rows[0].items() if name != "actor"}
+    for name in _MEASURED:
+        known = [one[name] for one in rows if one[name] is not None]
+        row[name] = float(np.mean(known)) if known else None
+    found = mean_of_trials(np.array([one["capped_mm"] for one in rows]))
+    row["low_mm"], row["high_mm"] = (found and found["interval"]) or (None, None)
+    row["violations"] = sum(one["violations"] for one in rows)
+    return row
+
+
+def _count_walks(best: Sequence[Path], other: Sequence[Path]) -> dict[str, int]:
+    """Count the walks in which the best combination is worth flying instead of another, and the reverse."""
+    counts = {"better": 0, "worse": 0, "walks": len(best)}
+    for places in zip(best, other, strict=True):
+        one, two = (read_result(place).measured for place in places)
+        if one is not None and two is not None:
+            signs = worth_flying(figures_of(one, two, np.ones(one.error_m.shape, dtype=np.bool_)))
+            counts["better"] += max(signs) > 0 and min(signs) >= 0
+            counts["worse"] += min(signs) < 0 and max(signs) <= 0
+    return counts
 
 
 def _no_skeleton(place: Path) -> DataError:
@@ -401,7 +530,7 @@ def _replay_settings(stated: Stated) -> ReplanSettings:
     settings = settings_of(
         stated.get("config", ()),
         arms=None,
-        trials=_whole(stated, "trials", 1, 10_000, 10),
+        trials=_whole(stated, "trials", 1, 10_000, ReplanSettings().trials),
         seed=_whole(stated, "seed", 0, 2**32 - 1, 0),
         pose_noise=" + ".join(stated["pose_noise"]) if "pose_noise" in stated else None,
     )
@@ -420,20 +549,24 @@ def _whole(stated: Stated, name: str, least: int, most: int, default: int) -> in
 def _cells(varied: Stated) -> Iterator[dict[str, Any]]:
     """Yield every combination of the values, by variable; the arm is `adaptive` if none is stated."""
     stated = {"arm": ("adaptive",), **varied}
+    if "actor" in stated:
+        stated["actor"] = tuple(_walk_names(stated["actor"]))
     count = int(np.prod([len(set(values)) for values in stated.values()]))
     if count > _MAX_CELLS:
         raise DataError("study", f"{count} combinations", f"ask for at most {_MAX_CELLS}", code="too-large")
     kept = [list(dict.fromkeys(values)) for values in stated.values()]
     for values in product(*kept):
         yield {
-            name: value if name == "arm" else plain_yaml(Path("study"), value)
+            name: value if name in ("arm", "actor") else plain_yaml(Path("study"), value)
             for name, value in zip(stated, values, strict=True)
         }
 
 
 def _planner_of(planner: PlannerConfig, cell: Mapping[str, Any]) -> PlannerConfig:
     changes = {
-        _SETTINGS.get(name, name): value for name, value in cell.items() if name not in ("arm", "robots")
+        _SETTINGS.get(name, name): value
+        for name, value in cell.items()
+        if name not in ("arm", "robots", "actor")
     }
     checked = planner_config(changes, "study")
     return replace(planner, **{name: getattr(checked, name) for name in changes})
@@ -458,6 +591,7 @@ def _figures(
     mpjpe, share, covered = (errors[key] for key in ("mpjpe_mm", "pck150", "coverage"))
     return {
         "arm": cell["arm"],
+        **({"actor": cell["actor"]} if "actor" in cell else {}),
         "range_m": scene.config.radius_m,
         "tilt_deg": scene.config.tilt_deg,
         "robots": scene.drones,
@@ -517,10 +651,25 @@ def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
     ]
     if best["alike"]:
         words.append(f"No difference worth flying to {'; '.join(_named(rows[k]) for k in best['alike'])}")
+    for k, counts in enumerate(best.get("walks", ())):
+        if k != best["cell"]:
+            share = _share_interval(counts["better"], counts["walks"])
+            words.append(
+                f"It is better than {_named(rows[k])} in {counts['better']} of {counts['walks']} walks"
+                f" ({share}), worse in {counts['worse']}"
+            )
     least = min((row for row in rows if row["tradeoff"]), key=lambda row: float(row["path_m"]))
     if least is not own:
         words.append(f"Shortest is {_named(least)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm")
     return ". ".join(words)
+
+
+def _share_interval(count: int, of: int) -> str:
+    """Say the interval of a share that was counted (Wilson 1927), in percent."""
+    z = 1.96
+    middle, reach = count + z**2 / 2, z * np.sqrt(count * (of - count) / of + z**2 / 4)
+    low, high = (100 * (middle + sign * reach) / (of + z**2) for sign in (-1, 1))
+    return f"{low:.0f} to {high:.0f} %"
 
 
 def _named(row: dict[str, Any]) -> str:

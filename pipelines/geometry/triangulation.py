@@ -128,10 +128,13 @@ class Triangulation:
     residual_px: Float  # [N, C] reprojection distance of every view, also rejected ones; inf behind a camera
 
 
-def triangulate(views: Views, *, method: Method, min_views: int = 2, gate: float = GATE) -> Triangulation:
+def triangulate(
+    views: Views, *, method: Method, min_views: int = 2, gate: float = GATE, with_covariance: bool = True
+) -> Triangulation:
     """Triangulate every joint-frame by a method of the module; ValueError for min_views below 2, or no gate.
 
-    `gate` counts standard deviations of a view's image point, pixel and pose noise together. Statuses besides
+    `gate` counts standard deviations of a view's image point, pixel and pose noise together. Covariances are
+    NaN `with_covariance` False, which saves a third of the time. Statuses besides
     "ok":
 
     * `not_detected`: by no camera.
@@ -147,7 +150,7 @@ def triangulate(views: Views, *, method: Method, min_views: int = 2, gate: float
     blocks = []
     for first in range(0, max(len(views.weight), 1), _BLOCK):
         part = slice(first, first + _BLOCK)
-        blocks.append(_triangulate_block(_rows(views, part), poses, method, min_views, gate))
+        blocks.append(_triangulate_block(_rows(views, part), poses, method, min_views, gate, with_covariance))
     return Triangulation(*(np.concatenate(results) for results in zip(*blocks, strict=True)))
 
 
@@ -171,7 +174,7 @@ def _poses_of(views: Views) -> _Poses:
 
 
 def _triangulate_block(
-    views: Views, poses: _Poses, method: Method, min_views: int, gate: float
+    views: Views, poses: _Poses, method: Method, min_views: int, gate: float, with_covariance: bool
 ) -> tuple[Float, Bool, Int8, Float, Int64, Float]:
     """Triangulate some joint-frames; return the fields of `Triangulation`."""
     at = views.pose_index
@@ -215,9 +218,10 @@ def _triangulate_block(
         status[(status == 0) & behind] = STATUS.index("rejected")
     ok = status == 0
     inlier &= ok[:, None]
-    covariance = _covariance(method, place, rotation, length2, weight, noise, inlier)
+    covariance = np.full((len(ok), 3, 3), np.nan)
+    if with_covariance:
+        covariance[ok] = _covariance(method, place, rotation, length2, weight, noise, inlier)[ok]
     points = np.where(ok[:, None], point + poses.middle[at], np.nan)
-    covariance = np.where(ok[:, None, None], covariance, np.nan)
     return points, inlier, status, covariance, inlier.sum(axis=1), reprojection_px(views, points)
 
 
@@ -249,8 +253,8 @@ def _midpoints(direction: Float, centre: Float, weight: Float, wanted: Bool) -> 
 
 def _closed(normal: Float) -> Float:
     """Add a little information to normal matrices [N, 3, 3] of less than full rank."""
-    is_open = np.linalg.matrix_rank(normal, hermitian=True) < 3
     trace = np.maximum(np.trace(normal, axis1=1, axis2=2), np.finfo(float).tiny ** 0.5)
+    is_open = np.linalg.det(normal / trace[:, None, None]) <= 3.0 * np.finfo(float).eps
     more = np.where(is_open, _LEAST_INFORMATION * trace, 0.0)[:, None, None] * np.eye(3)
     closed: Float = np.asarray(normal + more)
     return closed

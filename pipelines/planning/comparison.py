@@ -4,7 +4,7 @@ Intervals are those of `geometry.metrics`: over the trials for errors, which are
 stretches of the flight for figures that depend on the flight's course.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
@@ -15,7 +15,14 @@ from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.metrics import LEVEL, STRETCH_S, intervals
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import TILT, slot_of
-from pipelines.planning.replay import LOGGED, ArmFlight, aimed_at, looks_rad, seen_people
+from pipelines.planning.replay import (
+    LOGGED,
+    ArmFlight,
+    MeasuredJoints,
+    aimed_at,
+    looks_rad,
+    seen_people,
+)
 from pipelines.planning.scene import ReplayScene
 from pipelines.planning.scores import blind_s, score, view_quality
 from pipelines.planning.scores import coverage as viewed
@@ -33,6 +40,9 @@ SAME_RANGE_M = 0.3
 # The field counts a joint as right within this distance (PCK at 150 mm).
 PCK_M = 0.15
 
+WORTH = f"{SMALLEST_DIFFERENCE_POINTS:g} point or {SMALLEST_DIFFERENCE_MM:g} mm"
+"""The smallest differences of a practical size, as a verdict states them."""
+
 # The figures that decide, how many of their units are a smallest difference, and the sign of better.
 _DECISIVE = {"pck150": (SMALLEST_DIFFERENCE_POINTS / 100, 1), "mpjpe_mm": (SMALLEST_DIFFERENCE_MM, -1)}
 
@@ -40,21 +50,40 @@ MeanWithInterval = dict[str, Any]
 """`mean`, and `interval`: the ends that hold it with `LEVEL` probability; None where there is none."""
 
 
+# The figures of arms without a skeleton.
+_NOTHING: dict[str, MeanWithInterval | None] = dict.fromkeys(("mpjpe_mm", "coverage", "pck150"))
+
+
 def mean_of_trials(values: Float) -> MeanWithInterval | None:
     """Compute the mean of a figure over trials [K]; None without any, no interval for a single one."""
-    return _mean(values, None, 0)
+    return _ratio(values[:, None], np.ones((len(values), 1)))
 
 
 def mean_over_time(values: Float, t_ns: Int64, seed: int) -> MeanWithInterval | None:
     """Compute the mean of [T] values over a flight, resampled in stretches."""
-    return _mean(values, t_ns, seed)
-
-
-def _mean(values: Float, t_ns: Int64 | None, seed: int) -> MeanWithInterval | None:
     if not len(values):
         return None
     ends = intervals({"mean": (values, np.ones(len(values)))}, t_ns, seed=seed)["mean"]
     return {"mean": float(values.mean()), "interval": None if ends is None else list(ends)}
+
+
+def _ratio(sums: Float, weights: Float, t_ns: Int64 | None = None) -> MeanWithInterval | None:
+    """Compute a ratio of totals [K, T] over trials and times; None where nothing has a weight.
+
+    The interval is Student's over the trials. With `t_ns` [T] the trials share one film, whose errors are a
+    draw, too: its interval over stretches is added, as independent errors are.
+    """
+    if not weights.sum() > 0:
+        return None
+    mean = float(sums.sum() / weights.sum())
+    parts = [intervals({"": (sums.sum(axis=1), weights.sum(axis=1))}, None)[""]]
+    if t_ns is not None:
+        parts.append(intervals({"": (sums.sum(axis=0), weights.sum(axis=0))}, t_ns)[""])
+    reaches = [(ends[1] - ends[0]) / 2 for ends in parts if ends is not None]
+    if len(reaches) < len(parts):
+        return {"mean": mean, "interval": None}
+    reach = float(np.hypot.reduce(reaches))
+    return {"mean": mean, "interval": [mean - reach, mean + reach]}
 
 
 def common_frames(errors: Mapping[str, Float32]) -> Bool:
@@ -67,43 +96,42 @@ def common_frames(errors: Mapping[str, Float32]) -> Bool:
     return np.logical_and.reduce(measured) if measured else np.zeros(shape, dtype=np.bool_)
 
 
-def mpjpe_mm(error_m: Float32, counted: Bool) -> Float:
-    """Compute the mean error of each trial over the joint-frames [K, T, J] that count.
+def figures_of(
+    measured: MeasuredJoints, less: MeasuredJoints | None, shared: Bool, t_ns: Int64 | None = None
+) -> dict[str, MeanWithInterval | None]:
+    """Compute the figures of one arm, or of one `less` another: means with intervals, by name.
 
-    Returns:
-        [K], or fewer: trials in which none counts are left out.
+    `mpjpe_mm` is over the joint-frames [K, T, J] that are `shared`. `coverage` and `pck150` are shares of all
+    joint-frames with a truth that were measured, and that were within `PCK_M`: what was not measured is
+    wrong. With `t_ns` [T] the errors are of one film (`_ratio`).
     """
-    number = counted.sum(axis=(1, 2))
-    total = np.where(counted, error_m, 0.0).sum(axis=(1, 2), dtype=np.float64)
-    has_any = number > 0
-    mean: Float = 1e3 * total[has_any] / number[has_any]
-    return mean
+    arms = [measured] if less is None else [measured, less]
+    counted = np.logical_and.reduce([shared, *(np.isfinite(arm.error_m) for arm in arms)])
+    frames = np.full(counted.shape[:2], measured.joint_frames / max(counted.shape[1], 1))
+
+    def found(sums: Callable[[Float32], Float], weights: Float) -> MeanWithInterval | None:
+        each = [sums(arm.error_m) for arm in arms]
+        return _ratio(each[0] if less is None else each[0] - each[1], weights, t_ns)
+
+    return {
+        "mpjpe_mm": found(
+            lambda error_m: 1e3 * np.where(counted, error_m, 0.0).sum(axis=2, dtype=np.float64),
+            counted.sum(axis=2, dtype=np.float64),
+        ),
+        "coverage": found(lambda error_m: np.isfinite(error_m).sum(axis=2, dtype=np.float64), frames),
+        "pck150": found(lambda error_m: (error_m <= PCK_M).sum(axis=2, dtype=np.float64), frames),
+    }
 
 
-def pck(error_m: Float32, joint_frames: int) -> Float:
-    """Compute the share [K] of the joint-frames with a truth whose error is at most `PCK_M`, 0..1.
-
-    Joints that were not measured count as wrong.
-    """
-    share: Float = (error_m <= PCK_M).sum(axis=(1, 2)) / max(joint_frames, 1)
-    return share
-
-
-def capped_mm(error_m: Float32, joint_frames: int) -> Float:
+def capped_mm(measured: MeasuredJoints) -> Float:
     """Compute the mean error [K] over all joint-frames with a truth, each at most 150 mm (`PCK_M`).
 
     Joints that were not measured count as 150 mm off, so that missing joints cannot flatter.
     """
-    error = np.where(np.isfinite(error_m), error_m, PCK_M).astype(np.float64)
+    error = np.where(np.isfinite(measured.error_m), measured.error_m, PCK_M).astype(np.float64)
     gained = (PCK_M - np.minimum(error, PCK_M)).sum(axis=(1, 2))
-    capped: Float = 1e3 * (PCK_M - gained / max(joint_frames, 1))
+    capped: Float = 1e3 * (PCK_M - gained / max(measured.joint_frames, 1))
     return capped
-
-
-def coverage(error_m: Float32, joint_frames: int) -> Float:
-    """Compute the share [K] of the joint-frames with a truth that were measured, 0..1."""
-    share: Float = np.isfinite(error_m).sum(axis=(1, 2)) / max(joint_frames, 1)
-    return share
 
 
 @dataclass(frozen=True)
@@ -111,8 +139,7 @@ class ArmResult:
     """Flight of one arm, and what its cameras measured."""
 
     flight: ArmFlight
-    error_m: Float32 | None  # [trials, P, J] NaN where not measured; None without a skeleton
-    joint_frames: int
+    measured: MeasuredJoints | None  # None without a skeleton
 
 
 def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
@@ -121,8 +148,8 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
     Errors are compared on common joint-frames: those that all arms measured in a trial, for `mpjpe_mm` and
     for the differences alike. `coverage` is the share that the arm itself measured.
     """
-    errors = {name: result.error_m for name, result in results.items() if result.error_m is not None}
-    shared = common_frames(errors) if errors else None
+    measured = {name: each.measured for name, each in results.items() if each.measured is not None}
+    shared = common_frames({name: each.error_m for name, each in measured.items()}) if measured else None
     seen = {name: seen_people(scene, result.flight) for name, result in results.items()}
     arms = {name: _scores(scene, name, result, seen[name], shared) for name, result in results.items()}
     reference = REFERENCE if REFERENCE in results else next(iter(results))
@@ -132,7 +159,8 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
         if name != reference
     ]
     alike = equal_ranges({name: arm["range_m"]["mean"] for name, arm in arms.items()})
-    best = _best(results, arms, list(arms), shared)
+    breaking = {name for name, arm in arms.items() if sum(arm["limit_violations"].values())}
+    best = judge(measured, breaking)
     broken = [line for name, arm in arms.items() if (line := broken_limits(name, arm, scene.config))]
     settings, flight = scene.settings, scene.flight
     return {
@@ -153,7 +181,13 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
         "arms": arms,
         "differences": differences,
         "best": best,
-        "equal_ranges": [{"arms": names, "best": _best(results, arms, names, shared)} for names in alike],
+        "equal_ranges": [
+            {
+                "arms": names,
+                "best": judge({name: measured[name] for name in names if name in measured}, breaking),
+            }
+            for names in alike
+        ],
         "verdict": ". ".join([*broken, verdict(best, list(arms))]),
         "notes": list(scene.notes),
         "warnings": [*broken, *_unequal(arms), *scene.warnings, *_warnings(scene, results)],
@@ -173,28 +207,20 @@ def _scores(
         people=scene.people,
         seen=seen,
     )
-    figures = _errors(result.error_m, result.joint_frames, shared)
+    own = result.measured
+    figures = _NOTHING if own is None or shared is None else figures_of(own, None, shared)
     return {
         **found,
         "mpjpe_mm": figures["mpjpe_mm"] and figures["mpjpe_mm"]["mean"],
         "simulated": name not in LOGGED,
         "drones": len(flown.position),
         "safety": flown.safety or None,
-        "reconstruction_error": {"simulated": True, **figures, "joint_frames": result.joint_frames},
+        "reconstruction_error": {
+            "simulated": True,
+            **figures,
+            "joint_frames": 0 if own is None else own.joint_frames,
+        },
         **_by_person(scene, result, seen, shared),
-    }
-
-
-def _errors(
-    error_m: Float32 | None, joint_frames: int, shared: Bool | None
-) -> dict[str, MeanWithInterval | None]:
-    """Compute the errors of common joint-frames, the share that was measured, and the share within 150 mm."""
-    if error_m is None or shared is None:
-        return dict.fromkeys(("mpjpe_mm", "coverage", "pck150"))
-    return {
-        "mpjpe_mm": mean_of_trials(mpjpe_mm(error_m, shared & np.isfinite(error_m))),
-        "coverage": mean_of_trials(coverage(error_m, joint_frames)),
-        "pck150": mean_of_trials(pck(error_m, joint_frames)),
     }
 
 
@@ -220,11 +246,12 @@ def _by_person(scene: ReplayScene, result: ArmResult, seen: Bool, shared: Bool |
             "blind_s": blind_s(scene.t_s, seen[p : p + 1]),
             "view_quality": each[p],
         }
-        if result.error_m is not None and shared is not None and scene.joints is not None:
-            joints = result.error_m.shape[2] // len(people)
+        if result.measured is not None and shared is not None and scene.joints is not None:
+            joints = shared.shape[2] // len(people)
             own = slice(p * joints, (p + 1) * joints)
             frames = int(np.isfinite(scene.joints[:, own, 0]).sum())
-            by_person[name] |= _errors(result.error_m[:, :, own], frames, shared[:, :, own])
+            one = MeasuredJoints(result.measured.error_m[:, :, own], frames)
+            by_person[name] |= figures_of(one, None, shared[:, :, own])
     return over_all | {"by_person": by_person}
 
 
@@ -241,25 +268,15 @@ def _difference(
         [1.0 - seen[name].mean(axis=(0, 1)) for name in names],
     )
     seed = scene.settings.seed
+    measured = one.measured, other.measured
+    errors = _NOTHING
+    if shared is not None and measured[0] is not None and measured[1] is not None:
+        errors = figures_of(measured[0], measured[1], shared)
     return {
         "tilt_deg": mean_over_time(tilts[0] - tilts[1], scene.t_ns, seed),
         "occluded_share": mean_over_time(hidden[0] - hidden[1], scene.t_ns, seed),
-        **_error_difference(one, other, shared),
+        **errors,
         "simulated": True,
-    }
-
-
-def _error_difference(
-    one: ArmResult, other: ArmResult, shared: Bool | None
-) -> dict[str, MeanWithInterval | None]:
-    a, b, frames = one.error_m, other.error_m, (one.joint_frames, other.joint_frames)
-    if a is None or b is None or shared is None:
-        return dict.fromkeys(("mpjpe_mm", "coverage", "pck150"))
-    both = shared & np.isfinite(a) & np.isfinite(b)  # one may have measured none
-    return {
-        "mpjpe_mm": mean_of_trials(mpjpe_mm(a, both) - mpjpe_mm(b, both)),
-        "coverage": mean_of_trials(coverage(a, frames[0]) - coverage(b, frames[1])),
-        "pck150": mean_of_trials(pck(a, frames[0]) - pck(b, frames[1])),
     }
 
 
@@ -287,23 +304,22 @@ def told_apart(found: MeanWithInterval) -> bool:
     return bool(found["mean"]) and (ends is None or not ends[0] <= 0.0 <= ends[1])
 
 
-def _best(
-    results: Mapping[str, ArmResult],
-    arms: Mapping[str, Mapping[str, Any]],
-    names: Sequence[str],
-    shared: Bool | None,
+def judge(
+    measured: Mapping[str, MeasuredJoints], breaking: Collection[str], t_ns: Int64 | None = None
 ) -> dict[str, Any] | None:
-    """Find the arms that no other one beats; None if fewer than two of these measured anything."""
+    """Find the arms that no other one beats; None if fewer than two of these measured anything.
 
-    def right(name: str) -> float:
-        return float((arms[name]["reconstruction_error"]["pck150"] or {}).get("mean") or 0.0)
-
-    measured = sorted((name for name in names if right(name)), key=right, reverse=True)
-    kept = [name for name in measured if not sum(arms[name]["limit_violations"].values())] or measured
+    Arms that are `breaking` limits are left out, unless all are. With `t_ns` [T] the errors are of films.
+    """
+    share = {name: float((arm.error_m <= PCK_M).sum()) / arm.error_m.size for name, arm in measured.items()}
+    able = sorted((name for name in share if share[name]), key=lambda name: -share[name])
+    kept = [name for name in able if name not in breaking] or able
     if len(kept) < 2:
         return None
+    shared = common_frames({name: arm.error_m for name, arm in measured.items()})
     change = {
-        pair: _error_difference(results[pair[0]], results[pair[1]], shared) for pair in permutations(kept, 2)
+        (one, other): figures_of(measured[one], measured[other], shared, t_ns)
+        for one, other in permutations(kept, 2)
     }
     judged = {pair: worth_flying(found) for pair, found in change.items()}
     beaten = {other for (_, other), signs in judged.items() if max(signs) > 0 and min(signs) >= 0}
@@ -315,9 +331,21 @@ def _best(
     return {
         "arms": unbeaten,
         "disagree": disagreeing is not None,
-        "left_out": [name for name in measured if name not in kept],
+        "worse": rest,
+        "left_out": [name for name in able if name not in kept],
         "difference": {"arm": first, "against": second, **change[first, second]},
     }
+
+
+def outcome(best: Mapping[str, Any]) -> str:
+    """Say which arm is better, that none is, or that the figures disagree."""
+    arm, other = best["difference"]["arm"], best["difference"]["against"]
+    if best["disagree"]:
+        return f"the figures disagree: {arm} has more joints right, {other} is more accurate"
+    if len(best["arms"]) == 1:
+        return f"{arm} is better than {' and '.join(best['worse'])}"
+    worse = f", and both better than {' and '.join(best['worse'])}" if best["worse"] else ""
+    return f"no difference worth flying ({WORTH}) between {' and '.join(best['arms'])}{worse}"
 
 
 def verdict(best: Mapping[str, Any] | None, names: Sequence[str]) -> str:
@@ -325,19 +353,22 @@ def verdict(best: Mapping[str, Any] | None, names: Sequence[str]) -> str:
     if best is None:
         return f"{' and '.join(names)}: there is nothing to compare"
     difference = best["difference"]
-    arm, other = difference["arm"], difference["against"]
     points = _with_interval(difference["pck150"], 100.0, "points of joints within 150 mm")
     figures = f"{points}, {_with_interval(difference['mpjpe_mm'], 1.0, 'mm of mean error')} (simulated)"
     left = f"; {' and '.join(best['left_out'])} left out for broken limits" if best["left_out"] else ""
-    if best["disagree"]:
-        said = (
-            f"the figures disagree: {arm} has more joints right, {other} is more accurate; {arm} less {other}"
-        )
-    elif len(best["arms"]) == 1:
-        said = f"{arm} is better than {other}"
-    else:
-        said = f"no difference worth flying between {' and '.join(best['arms'])}; {arm} less {other}"
-    return f"{said}: {figures}{left}"
+    arm, other = difference["arm"], difference["against"]
+    pair = "" if (best["arms"], best["worse"]) == ([arm], [other]) else f"; {arm} less {other}"
+    return f"{outcome(best)}{pair}: {figures}{left}"
+
+
+def filmed_verdict(
+    best: Mapping[str, Any] | None, modelled: Mapping[str, Any] | None, names: Sequence[str]
+) -> str:
+    """Say what the films of the arms show; where the modelled measurement said otherwise, say that, too."""
+    said = f"filmed: {verdict(best, names)}"
+    if best is None or modelled is None or outcome(best) == outcome(modelled):
+        return said
+    return f"{said}. The model said otherwise ({outcome(modelled)}): the film counts"
 
 
 def _with_interval(found: MeanWithInterval | None, scale: float, unit: str) -> str:
@@ -376,13 +407,15 @@ def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return found
 
 
+def few_trials(trials: int) -> list[str]:
+    """Warn of intervals from few draws, in one line."""
+    if trials >= FEW_TRIALS:
+        return []
+    return [f"{trials} draws of noise are few: take {FEW_TRIALS} or more, or do not trust the intervals"]
+
+
 def _warnings(scene: ReplayScene, results: Mapping[str, ArmResult]) -> list[str]:
-    warnings = []
-    if scene.settings.trials < FEW_TRIALS and scene.flight.skeleton is not None:
-        warnings.append(
-            f"{scene.settings.trials} draws of noise are few: take --trials {FEW_TRIALS} or more, or do not"
-            " trust the intervals"
-        )
+    warnings = few_trials(scene.settings.trials) if scene.flight.skeleton is not None else []
     for name, result in results.items():
         gap_share = float(1.0 - result.flight.known.mean())
         if gap_share > 0:
@@ -390,7 +423,7 @@ def _warnings(scene: ReplayScene, results: Mapping[str, ArmResult]) -> list[str]
                 f"{name}: {100 * gap_share:.1f} % of its poses lie in gaps of the log: straight ways there,"
                 " and no pictures"
             )
-        if result.error_m is not None and not np.isfinite(result.error_m).any():
+        if result.measured is not None and not np.isfinite(result.measured.error_m).any():
             warnings.append(f"{name}: not a single joint could be measured from its cameras")
     return warnings
 

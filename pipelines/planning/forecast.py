@@ -53,15 +53,6 @@ class ActorFilter:
         self._covariance = kept + self._variance * gain[:, None] * gain
         self._t_s = t_s
 
-    def at(self, t_s: float) -> tuple[Float, Float, Float]:
-        """Predict the state (position m, velocity m/s, [3] each) and covariance [2, 2] per axis.
-
-        The time must be at or after the last measurement. ValueError: nothing was measured yet, or the time
-        is before the last measurement.
-        """
-        state, covariance = self._predicted(t_s)
-        return state[0], state[1], covariance
-
     def forecast(self, t_s: Float) -> Float:
         """Forecast positions [T, 3] at times [T], none of them before the last measurement."""
         if self._t_s is None:

@@ -7,6 +7,7 @@ replays. No measurement or map is used before its time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +18,8 @@ import pandas as pd
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Int64, Intrinsics
 from pipelines.geometry.cameras import project, undistort
-from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
+from pipelines.geometry.compilation import cached
+from pipelines.geometry.noise import NoiseModel, disturb, pose_errors, sum_sigma
 from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, rates, transform
 from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.planning.arms import Arm, RollingOut
@@ -282,6 +284,16 @@ LOGGED = (FLOWN, PLANNED)
 
 # The same standard deviation of a good keypoint is the first guess of `mocap reconstruct`.
 PIXEL_SIGMA_PX = 3.0
+# The joint estimate lets joints accelerate by this factor, or it would smooth kicks (`refine`).
+FAST_MOTION = 2.0
+# A person who stands sways; without any acceleration one error would be that of the whole flight.
+MIN_ACCELERATION_MPS2 = 0.1
+# Fewer pictures have no second difference in their middle.
+MIN_SMOOTHED_TIMES = 4
+# What all joints share is not farther off than this, even where no view tells it.
+FARTHEST_M = 100.0
+# This much information (1/m^2) keeps equations solvable where nothing was measured.
+LEAST_INFORMATION = 1e-6
 # Keypoints below this confidence are left out, as in `mocap reconstruct`.
 MIN_CONFIDENCE = 0.3
 
@@ -517,8 +529,9 @@ def measure(
 ) -> MeasuredJoints:
     """Measure a skeleton in several trials; sight is tested in the map of each moment.
 
-    The last `start_m` of a sight line, next to the joint, is left out: maps contain the person. Trial k of
-    camera i has the same random numbers for any other path.
+    Joints are triangulated by `robust`, and their errors smoothed as the joint estimate does. The last
+    `start_m` of a sight line, next to the joint, is left out: maps contain the person. Trial k of camera i
+    has the same random numbers for any other path.
     """
     joints = paths.joints
     cameras, times, count = len(paths.position), *joints.shape[:2]
@@ -535,6 +548,7 @@ def measure(
         free &= ~hidden_by_people(eyes, standing_in, others)
     sigma = np.stack([_pose_sigma(paths, i) for i in range(cameras)], axis=1)
     error = np.full((trials, times, count), np.nan, dtype=np.float32)
+    smoother = _Smoother(paths, standing_in)
     for trial in range(trials):
         rays = np.empty((times, count, cameras, 2))
         weight = np.empty((times, count, cameras))
@@ -561,10 +575,104 @@ def measure(
             pixel_sigma=np.full(cameras, PIXEL_SIGMA_PX),
             pose_sigma=sigma,
         )
-        points = triangulate(views, method="robust").points.reshape(joints.shape)
-        points[~known] = np.nan
-        error[trial] = np.sqrt(np.sum((points - joints) ** 2, axis=-1))
+        found = triangulate(views, method="robust", with_covariance=False)
+        off = found.points.reshape(joints.shape) - joints
+        off = smoother.smoothed(off, found.inlier.reshape(times, count, cameras))
+        error[trial] = np.sqrt(np.sum(off**2, axis=-1))
     return MeasuredJoints(error, int(known.sum()))
+
+
+class _Smoother:
+    """Smoothing over time by which the joint estimate reduces errors that change from picture to picture.
+
+    Errors of triangulated joints are divided into one that all joints share and the rest of each. Both are
+    smoothed by the least accelerations, as large as those of the joints, that agree with the information of
+    the views: keypoints for the rest, keypoints and white pose noise for what is shared. Constant and slow
+    pose errors stay.
+    """
+
+    def __init__(self, paths: CameraPaths, joints: Float) -> None:
+        step_s = float(np.median(np.diff(paths.t_ns))) / 1e9 if len(paths.t_ns) > 1 else 1.0
+        change = np.diff(paths.joints, 2, axis=0) / step_s**2
+        shared = change.mean(axis=1, keepdims=True) if change.size else change
+        moving = np.concatenate([shared, change - shared], axis=1)
+        known = np.isfinite(moving[..., 0])
+        square = np.where(known, np.sum(moving**2, axis=-1), 0.0).sum(axis=0) / np.maximum(
+            known.sum(axis=0), 1
+        )
+        least = np.maximum(FAST_MOTION * np.sqrt(square / 3.0), MIN_ACCELERATION_MPS2)
+        self._stiffness = 1.0 / (least * step_s**2) ** 2
+        pixel = np.array([(PIXEL_SIGMA_PX / _focal(lens)) ** 2 for lens in paths.intrinsics])[:, None]
+        white = np.square([pose_errors(models).white for models in paths.noise])[:, None]
+        across, square_m2 = _across_ray(paths.position[:, :, None] - joints)
+        self._information = across / (pixel[..., None] * square_m2)[..., None, None]  # [N, T, J, 3, 3]
+        self._across, square_m2 = _across_ray(paths.position - paths.middle)
+        self._pixel = pixel * square_m2  # [N, T]
+        self._pose = white[..., 0] + white[..., 1] * square_m2
+
+    def smoothed(self, off: Float, seen: Bool) -> Float:
+        """Smooth errors [T, J, 3] m of joints that cameras see, [T, J, N]; NaN stays."""
+        if len(off) < MIN_SMOOTHED_TIMES:
+            return off
+        there = np.isfinite(off[..., 0])
+        seen = seen & there[..., None]
+        own = np.einsum("tjc,ctjab->tjab", seen.astype(np.float64), self._information)
+        total = own.sum(axis=1) + np.eye(3) / FARTHEST_M**2
+        weighted = np.einsum("tjab,tjb->ta", own, np.where(there[..., None], off, 0.0))
+        shared = np.linalg.solve(total, weighted[..., None])[:, None, :, 0]
+        count = seen.sum(axis=1).T
+        variance = self._pixel / np.maximum(count, 1) + self._pose
+        common = np.sum(np.where(count > 0, 1.0 / variance, 0.0)[..., None, None] * self._across, axis=0)
+        series = np.concatenate([shared, np.where(there[..., None], off - shared, 0.0)], axis=1)
+        smooth(series, np.concatenate([common[:, None], own], axis=1), self._stiffness)
+        return np.where(there[..., None], series[:, :1] + series[:, 1:], np.nan)
+
+
+def _across_ray(offset: Float) -> tuple[Float, Float]:
+    """Return projections [..., 3, 3] across offsets [..., 3] m, and the squares of their lengths."""
+    square = np.sum(offset**2, axis=-1)
+    return np.eye(3) - offset[..., :, None] * offset[..., None, :] / square[..., None, None], square
+
+
+@cached
+def smooth(series: Float, information: Float, stiffness: Float) -> None:
+    """Smooth series [T, S, 3]: minimise sum (x - y)' W (x - y) + stiffness sum |second difference of x|^2.
+
+    The information W is [T, S, 3, 3], 0 where nothing was measured. The equations have a band of seven
+    diagonals below the main one, and are solved by Cholesky's method.
+    """
+    times, count = series.shape[:2]
+    rows = 3 * times
+    band, right = np.empty((rows, 7)), np.empty(rows)
+    for s in range(count):
+        for i in range(rows):
+            t, axis = i // 3, i % 3
+            inner = times - 2 - t  # of second differences, those that begin from here on
+            band[i] = 0.0
+            right[i] = 0.0
+            for b in range(3):
+                right[i] += information[t, s, axis, b] * series[t, s, b]
+                if b <= axis:
+                    band[i, 6 - axis + b] = information[t, s, axis, b]
+            begins, middle, ends = inner > 0, t > 0 and inner > -1, t > 1
+            band[i, 6] += stiffness[s] * (1.0 * begins + 4.0 * middle + 1.0 * ends) + LEAST_INFORMATION
+            band[i, 3] -= 2.0 * stiffness[s] * (1.0 * middle + 1.0 * ends)
+            band[i, 0] += stiffness[s] * ends
+            for k in range(max(0, 6 - i), 7):
+                j = i - 6 + k
+                left = band[i, k]
+                for m in range(max(0, j - 6, i - 6), j):
+                    left -= band[i, m - i + 6] * band[j, m - j + 6]
+                band[i, k] = left / band[j, 6] if j < i else math.sqrt(max(left, LEAST_INFORMATION))
+        for i in range(rows):
+            for j in range(max(0, i - 6), i):
+                right[i] -= band[i, j - i + 6] * right[j]
+            right[i] /= band[i, 6]
+        for i in range(rows - 1, -1, -1):
+            for j in range(i + 1, min(i + 7, rows)):
+                right[i] -= band[j, i - j + 6] * right[j]
+            right[i] /= band[i, 6]
+            series[i // 3, s, i % 3] = right[i]
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:

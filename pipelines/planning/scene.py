@@ -1,18 +1,25 @@
 """Data that all arms of a comparison share: actor, maps, cameras, skeleton, times and settings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
 from pipelines.geometry.metrics import matched
 from pipelines.geometry.noise import NoiseModel, White, sum_sigma
-from pipelines.geometry.poses import gaps, interpolate_points, rates
+from pipelines.geometry.poses import (
+    gaps,
+    interpolate_points,
+    matrix_from_quaternion,
+    quaternion_from_rotation_vector,
+    rates,
+)
 from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
 from pipelines.planning.distance_field import (
     OCCUPIED,
@@ -56,6 +63,8 @@ COMMAND_HOLDS_NS = 2_000_000_000
 MIN_FLIGHT_S = 1.0
 # Voxels of 0.5 m, soft ground and errors of the hips explain less between the map's ground and the feet.
 LARGEST_OFFSET_M = 1.0
+# Nobody climbs more within a second: what is higher is no ground, but stands in the way.
+HIGHEST_STEP_M = 1.5
 # Probabilities are 0 to 1, so that this marks places beyond the map.
 OUTSIDE = -1.0
 # Others who are reconstructed at less than half of the first person's times are not filmed again.
@@ -166,6 +175,69 @@ def points_at(motion: JointMotion, t_ns: Int64) -> Float:
     step_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
     longest_ns = max(MIN_INTERPOLATED_NS, round(MAX_STEPS_INTERPOLATED * step_ns))
     return interpolate_points(motion.t_ns, motion.position, t_ns, max_gap_ns=longest_ns)
+
+
+class OtherWalk(NamedTuple):
+    """Variation of a logged way, for people who walk it another time."""
+
+    speed: float = 1.0  # factor
+    delay_s: float = 0.0  # for which everybody stands still
+    turn_deg: float = 0.0  # counterclockwise, of the rest of the way
+    share: float = 0.5  # of the flight, at which people stand or turn
+
+
+def walked_otherwise(flight: LoggedFlight, walk: OtherWalk, maps: Sequence[Occupancy]) -> LoggedFlight:
+    """Return the flight as if everybody had walked otherwise, over the ground of the last map.
+
+    Joints move as logged, only faster, later or in another direction. DataError: something stands in the way.
+    """
+    t_ns, first_ns = flight.actor_t_ns, int(flight.actor_t_ns[0])
+    when_ns = first_ns + walk.share * float(np.ptp(t_ns))
+    middle = positions_at(t_ns, flight.actor, np.array([round(when_ns)]))[:, 0].mean(axis=0)
+    turn = matrix_from_quaternion(
+        quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(walk.turn_deg)]))
+    )
+
+    climb_m = np.zeros(len(t_ns))
+    if maps and walk.turn_deg:
+        way = np.average(positions_at(t_ns, flight.actor, t_ns), axis=0, weights=flight.weights)
+        turned = np.where((t_ns > when_ns)[:, None], middle + (way - middle) @ turn.T, way)
+        steps = np.subtract(*(_ground_above_feet(maps[-1], places) for places in (turned, way)))
+        known = np.isfinite(steps)
+        if known.any():
+            steps = np.interp(t_ns, t_ns[known], steps[known])
+            second = max(round(1e9 / float(np.median(np.diff(t_ns)))), 1)
+            highest_m = float(np.abs(steps[second:] - steps[:-second]).max(initial=0.0))
+            if highest_m > HIGHEST_STEP_M:
+                problem = (
+                    f"a way turned by {walk.turn_deg:.0f} deg rises by {highest_m:.1f} m within a second"
+                )
+                raise DataError("actor", problem, "turn it by another angle", code="bad-value")
+            climb_m = uniform_filter1d(steps, second, mode="nearest")
+
+    def moved(stamps: Int64, at: Callable[[Int64], Float]) -> tuple[Int64, Float]:
+        lasts_ns = (stamps[-1] - first_ns) / walk.speed + walk.delay_s * 1e9
+        step_ns = max(int(np.median(np.diff(stamps))), 1)
+        new_ns = np.arange(stamps[0], first_ns + lasts_ns, step_ns).astype(np.int64)
+        walked_ns = walk.speed * (new_ns - first_ns)
+        stands_ns = when_ns - first_ns
+        late_ns = np.clip(walked_ns - stands_ns, 0.0, walk.speed * walk.delay_s * 1e9)
+        old_ns = np.clip(first_ns + walked_ns - late_ns, stamps[0], stamps[-1]).astype(np.int64)
+        place, after = at(old_ns), old_ns > when_ns
+        place[after] = middle + (place[after] - middle) @ turn.T
+        place[..., 2] += np.interp(old_ns, t_ns, climb_m).reshape(-1, *(1,) * (place.ndim - 2))
+        return new_ns, place
+
+    def motion(of: JointMotion | None) -> JointMotion | None:
+        if of is None:
+            return None
+        new_ns, place = moved(of.t_ns, partial(points_at, of))
+        return JointMotion(new_ns, of.joints, place)
+
+    new_ns, actor = moved(t_ns, lambda old_ns: positions_at(t_ns, flight.actor, old_ns).swapaxes(0, 1))
+    return replace(
+        flight, actor_t_ns=new_ns, actor=actor, hips=motion(flight.hips), skeleton=motion(flight.skeleton)
+    )
 
 
 def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> tuple[Float, Float, Bool]:
@@ -386,8 +458,8 @@ def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:
 
 # More drones are refused, because no comparison of more was ever checked.
 MOST_DRONES = 8
-# The detector's errors are modelled for 30 Hz, and 25 divide the 50 of the tracking.
-PICTURES_HZ = 25.0
+# A film of the arms has as many pictures; errors of five a second are nearly independent.
+PICTURES_HZ = 5.0
 # Errors of poses change slowly along a flight, so that the mean over 200 moments is that of all.
 NOISE_LOOKS = 200
 

@@ -207,7 +207,7 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
 
     Times count from `origin_ns`; the arms' colours follow those of the session's cameras, of this number.
     """
-    metrics = content.metrics
+    metrics, filmed = content.metrics, content.filmed
     arms = tuple(
         _arm(name, own, content, origin_ns=origin_ns, colour=cameras + k)
         for k, (name, own) in enumerate(content.arms.items())
@@ -220,9 +220,9 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
     return Replan(
         arms=arms,
         around=around,
-        verdict=text(metrics, "verdict"),
-        setting=_setting(metrics),
-        tables=tuple(_tables(metrics)),
+        verdict=text(filmed, "verdict") or text(metrics, "verdict"),
+        setting=_setting(metrics) + (f" Modelled: {text(metrics, 'verdict')}." if filmed else ""),
+        tables=(*_film_table(filmed), *_tables(metrics)),
         notes=tuple(str(note) for note in items(metrics, "notes")),
     )
 
@@ -287,7 +287,7 @@ def _setting(metrics: Mapping[str, object]) -> str:
     error = filmed.get(skeleton, f"simulated in {trials} of the skeleton of {skeleton}")
     return (
         f"{plural(drones, 'drone')} over {fixed(number(metrics, 'duration_s'))} s."
-        f" Reconstruction error: {error}, each picture for itself, so that it is larger than the estimate's."
+        f" Reconstruction error: {error}, smoothed as the estimate smooths it."
     )
 
 
@@ -350,6 +350,32 @@ def _tables(metrics: Mapping[str, object]) -> list[Table]:
         ),
     ]
     return [one for one in found if one.rows]
+
+
+def _film_table(metrics: Mapping[str, object]) -> list[Table]:
+    if not metrics:
+        return []
+    arms, rate = section(metrics, "arms"), fixed(number(metrics, "rate_hz"))
+    rows = [
+        [
+            arm,
+            fixed(number(section(arms, arm), "pictures"), 0),
+            fixed(number(section(section(arms, arm), "tilt_deg"), "mean")),
+            percent(number(section(arms, arm), "keypoint_pck")),
+            *_estimates(section(section(arms, arm), "reconstruction_error"), _ERRORS),
+        ]
+        for arm in arms
+    ]
+    columns = [
+        Column("Arm", text=True),
+        Column("Pictures"),
+        Column("Tilt", "mean, deg"),
+        Column("Keypoints", "right"),
+    ]
+    title = f"Filmed (rendered) at {rate} Hz, keypoints by {text(metrics, 'detector')}, with intervals."
+    return [
+        Table("arms-filmed", title, [*columns, *(column for column, *_ in _ERRORS)], rows, "measures arms")
+    ]
 
 
 _ARM_FIGURES: tuple[tuple[Column, tuple[str, ...]], ...] = (

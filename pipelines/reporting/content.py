@@ -30,6 +30,7 @@ class ReplanContent:
     arms: dict[str, pd.DataFrame]  # arm: tables.REPLAN
     actor: pd.DataFrame  # tables.ACTOR at the same times: the reference of the arms' scores
     map: Occupancy | None = None  # the session's last map
+    filmed: dict[str, object] = field(default_factory=dict)  # film/metrics.json of this comparison
 
 
 @dataclass(frozen=True)

@@ -233,7 +233,8 @@ def draw(folder: Path, metrics: Mapping[str, Any]) -> None:
 def setting(metrics: Mapping[str, Any]) -> str:
     """Describe what was filmed or flown, and the number of trials."""
     if metrics["kind"] == "session":
-        return f"replays of the flight, keypoints: {metrics['keypoints']}; trials: {metrics['trials']}"
+        walks = f" over {plural(metrics['walks'], 'walk')}" if metrics["walks"] > 1 else ""
+        return f"replays of the flight{walks}, keypoints: {metrics['keypoints']}; trials: {metrics['trials']}"
     settings, cells = metrics["settings"], metrics["cells"]
     alike = [f"{cells[0]['robots']} drones"] if len({cell["robots"] for cell in cells}) == 1 else []
     alike += [f"tilt {cells[0]['tilt_deg']:g} deg"] if len({cell["tilt_deg"] for cell in cells}) == 1 else []

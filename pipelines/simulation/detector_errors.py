@@ -32,6 +32,9 @@ _LEAST_MISSED = 0.01
 KEPT_PER_FRAME = 0.7
 """Autocorrelation of a joint's error from one frame to the next: 0.1 s at 30 frames a second."""
 
+MODELLED_HZ = 30.0
+"""Rate of the frames of `KEPT_PER_FRAME`."""
+
 HIDDEN_MISSED_SHARE, HIDDEN_ERROR, HIDDEN_CONFIDENCE = 0.7, 4.0, 0.4
 """Share of hidden joints that are missed; factors of the others' errors and confidences to visible ones'."""
 
@@ -121,6 +124,7 @@ def detect_keypoints(
     *,
     joints: tuple[str, ...],
     table: ErrorTable | None = None,
+    rate_hz: float = MODELLED_HZ,
 ) -> tuple[Float, Float]:
     """Simulate the keypoints [T, J, 2] px of one person, NaN where missed, and confidences [T, J], then 0.
 
@@ -133,7 +137,8 @@ def detect_keypoints(
     `errors.scale` 0 all found keypoints are exact.
 
     The exact pixels are NaN for joints outside the picture; `visible` [T, J] is False where something hides
-    one, and takes no part in the random numbers. `table` is that of `errors.detector` by default.
+    one, and takes no part in the random numbers. Frames are `rate_hz` a second. `table` is that of
+    `errors.detector` by default.
     """
     table = read_errors(errors_of(errors.detector)) if table is None else table
     median_share, measured_missed, mean_confidence = table.at(tilt_deg, joints)
@@ -141,7 +146,7 @@ def detect_keypoints(
     growth = measured_missed / max(float(usual.mean()) if usual.size else 0.0, _LEAST_MISSED)
 
     shape = pixels.shape[:2]
-    unit_error = _correlated(shape, rng)
+    unit_error = _correlated(shape, KEPT_PER_FRAME ** (MODELLED_HZ / rate_hz), rng)
     angle, far = rng.uniform(0, 2 * np.pi, shape), rng.uniform(*OUTLIER_SHARES, shape)
     missed = rng.random(shape) < np.where(visible, errors.missed_share * growth, HIDDEN_MISSED_SHARE)
     outlier = rng.random(shape) < errors.outlier_share * growth
@@ -166,12 +171,12 @@ def detect_keypoints(
     return _exchanged(found, swapped, joints), _exchanged(confidence, swapped, joints)
 
 
-def _correlated(shape: tuple[int, ...], rng: np.random.Generator) -> Float:
+def _correlated(shape: tuple[int, ...], kept: float, rng: np.random.Generator) -> Float:
     """Draw unit normal errors [T, J, 2], each joint's correlated with those of the frame before."""
     error = rng.standard_normal((*shape, 2))
-    fresh = np.sqrt(1 - KEPT_PER_FRAME**2)
+    fresh = np.sqrt(1 - kept**2)
     for k in range(1, len(error)):
-        error[k] = KEPT_PER_FRAME * error[k - 1] + fresh * error[k]
+        error[k] = kept * error[k - 1] + fresh * error[k]
     return error
 
 

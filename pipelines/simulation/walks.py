@@ -15,7 +15,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.cameras import undistort
-from pipelines.geometry.metrics import common, measure
+from pipelines.geometry.metrics import measure
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates
 from pipelines.geometry.rig import BodyMotion
@@ -276,18 +276,6 @@ def measure_arm(
         "reprojection_px": _reprojection_px(views, points),
         **{name: errors[name] for name in _ERRORS},
     }
-
-
-def errors_in_common(
-    points: Mapping[str, Float], true_joints: Mapping[str, Float]
-) -> dict[str, float | None]:
-    """Compute each arm's MPJPE (mm) on the joint-frames [T, J, 3] m that all arms have; None without any."""
-    shared = common(*(own[:, None] for own in points.values()))[:, 0]
-    found: dict[str, float | None] = {}
-    for name, own in points.items():
-        error_m = np.linalg.norm(own - true_joints[name], axis=-1)[shared]
-        found[name] = 1e3 * float(error_m.mean()) if error_m.size else None
-    return found
 
 
 def _reprojection_px(views: Views, points: Float) -> dict[str, float] | None:

@@ -12,8 +12,11 @@ from click.testing import CliRunner, Result
 from mocap_cli.main import Mocap
 from mocap_cli.study import study_command
 from pipelines import study as stage
+from pipelines.planning.scene import OtherWalk, load_flight, walked_otherwise
 from pipelines.replan import fly_and_measure
+from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
+from pipelines.session.maps import load_maps
 from pipelines.simulation.walks import RANGE_M
 from pipelines.study import Studied, study
 from tests.commands.runner import content
@@ -232,9 +235,38 @@ def test_an_interrupted_study_of_a_session_goes_on_and_ranks_what_is_known(
     assert "trade-off" in again.output
 
 
+def test_a_verdict_says_in_how_many_other_walks_it_holds(calm: Path, tmp_path: Path) -> None:
+    """Of two drones from 8 m and from 20 m, the near ones measure better whoever walks how."""
+    grid = ("range_m=8,20", "actor=3", "trials=4", "pose_noise=white:rotation_deg=2", calm)
+    done = run(*grid, "-o", tmp_path / "out", "--json")
+    assert done.exit_code == 0, done.stderr
+    metrics = json.loads(done.stdout)
+    assert (metrics["walks"], len(metrics["cells"]), metrics["best"]["cell"]) == (3, 2, 0)
+    assert metrics["best"]["walks"][1] == {"better": 3, "worse": 0, "walks": 3}
+    assert "3 of 3" in metrics["verdict"]
+    with (tmp_path / "out" / "table.csv").open(encoding="utf-8") as file:
+        paths = {row["actor"]: row["path_m"] for row in csv.DictReader(file) if float(row["range_m"]) == 8}
+    assert len(set(paths.values())) == 3
+
+
+def test_a_walk_is_varied_as_stated(calm: Path) -> None:
+    flight = load_flight(calm, read_description(calm), None, pose_noise=None)
+    walk = OtherWalk(speed=0.5, delay_s=2.0, turn_deg=90.0)
+    other = walked_otherwise(flight, walk, load_maps(calm))
+    seconds = [float(np.ptp(each.actor_t_ns)) / 1e9 for each in (flight, other)]
+    assert seconds[1] == pytest.approx(2 * seconds[0] + 2.0, abs=0.2)
+    assert other.skeleton is not None
+    hips = other.skeleton.position[:, 0].mean(axis=1)
+    start, middle, end = hips[0], hips[len(hips) // 2], hips[-1]
+    away = [np.arctan2(*(b - a)[1::-1]) for a, b in ((start, middle), (middle, end))]
+    assert np.degrees(away[1] - away[0]) == pytest.approx(90.0, abs=5.0)  # the truth sways
+    stands = slice(len(hips) // 2 - 20, len(hips) // 2 + 20)
+    assert np.ptp(hips[stands], axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
+
+
 def test_wrong_values_over_a_session_are_refused(calm: Path, tmp_path: Path) -> None:
     many = f"range_m={','.join(str(k) for k in range(1, 252))}"
-    for words in (["arm=flown"], [many, "robots=2,3"], ["range_m=8,x"], ["w_nothing=3"], ["tilt_deg=99"]):
+    for words in (["arm=flown"], [many, "robots=2,3"], ["range_m=8,x"], ["w_nothing=3"], ["actor=lazy:1"]):
         with pytest.raises(DataError):
             study(words, calm, tmp_path / "out")
     assert not list(tmp_path.iterdir())
