@@ -55,7 +55,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.maps import MapSizeError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.recognition import EXPECTED, describe_unknown, recognise
+from pipelines.session.recognition import EXPECTED, describe_unknown, recognise, refuse_pointers
 from pipelines.session.records import SHARED_SECONDS, UNTIMED, PoseSample
 from pipelines.session.registries import (
     FORMATS,
@@ -384,6 +384,7 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Propo
 def _described(
     path: Path, place: NamePlace, format_: Format, ambiguous: bool
 ) -> Iterator[Proposal | FoundLog]:
+    refuse_pointers(path)
     file: dict[str, object] = {"file": path}
     head, labels, title = (path, place), (label_of_place(place),), format_.title
     if isinstance(format_, KeypointFormat):

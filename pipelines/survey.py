@@ -12,7 +12,7 @@ from pipelines.planning.scene import replan_settings
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Manifest, read_flight
-from pipelines.session.recognition import EXPECTED, describe_unknown
+from pipelines.session.recognition import EXPECTED, describe_unknown, refuse_pointers
 from pipelines.session.registries import FORMATS
 from pipelines.session.stages import STAGES, open_session, outdated
 from pipelines.session.storage import SCHEMA, SIMULATION_MARK, STUDY_MARK, read_json, refuse_special
@@ -38,6 +38,7 @@ def survey(path: Path) -> list[Survey]:
     if not path.exists():
         raise DataError(path, "does not exist", "check the path", code="no-such-file")
     refuse_special(path)
+    refuse_pointers(path)
     if (path / "session.json").is_file():
         return [Survey(path, "session", _of_session(path))]
     if made := _of_summary(path):

@@ -6,6 +6,8 @@ import stat
 import tomllib
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -54,6 +56,7 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
             remedy = "films alone give no place: log it, and write {file: track.gpx, attitude: pictures}"
         raise DataError(path, "does not exist", remedy, code="no-such-file")
     refuse_special(path)
+    refuse_pointers(path)
     candidates = [f for f in FORMATS.all() if isinstance(f, protocols)]
     matches = [f for f in candidates if f.recognises(path)]
     if len(matches) == 1:
@@ -163,7 +166,7 @@ _UNREAD = (
 _DJI_BINARY = re.compile(rb"(?s).{16}BUILD|.{242}DJI_LOG_V3|LOGH|.{3}\0{5}..[\x01-\x1e]")
 _DJI_NAME = re.compile(r"DJIFlightRecord_|FLY\d{3}\.dat$", re.IGNORECASE)
 
-_LFS_POINTER = re.compile(rb"version https://git-lfs\.github\.com/spec/v\d+\n[^\0]{0,400}?size (\d{1,18})")
+_LFS_POINTER = re.compile(rb"version https://git-lfs\.github\.com/spec/v\d+\r?\n[^\0]{0,400}?size (\d{1,18})")
 
 
 def describe_lfs_pointer(head: bytes) -> Likeness | None:
@@ -172,6 +175,16 @@ def describe_lfs_pointer(head: bytes) -> Likeness | None:
     if match is None:
         return None
     return Likeness(f"is a pointer of Git LFS ({int(match[1])} bytes are elsewhere)", "run `git lfs pull`")
+
+
+def refuse_pointers(path: Path) -> None:
+    """Refuse, with a DataError, a pointer of Git LFS, or a folder that begins with one; pass all else."""
+    with suppress(OSError):
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        for file in islice(filter(Path.is_file, files), MAX_NAMES_IN_MESSAGE):
+            with file.open("rb") as content:
+                if pointer := describe_lfs_pointer(content.read(1024)):
+                    raise DataError(file, *pointer, code="wrong-kind")
 
 
 def describe_unknown(path: Path) -> Likeness:

@@ -58,7 +58,8 @@ def json_files(folder: Path) -> list[Path]:
 def samples(path: Path) -> list[object]:
     """Read the beginning of a JSON file, or of a few files across a folder, to recognise the format.
 
-    Lists are cut after their first entry, at the top and one level below. Unreadable files are skipped.
+    Lists are cut to their first entry that is not empty, at the top, or the first one level below. Unreadable
+    files are skipped.
     """
     if path.is_dir():
         files = json_files(path)
@@ -83,7 +84,8 @@ def _outline(path: Path, size: int, modified_ns: int) -> object:  # noqa: ARG001
     content = load_json(path)
     if isinstance(content, dict):
         return {key: value[:1] if isinstance(value, list) else value for key, value in content.items()}
-    return content[:1] if isinstance(content, list) else content
+    # Nobody may be seen in the first pictures.
+    return [next(filter(None, content), None)] if isinstance(content, list) and content else content
 
 
 def first_entry(sample: object) -> dict[str, object]:

@@ -27,11 +27,14 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS
 from pipelines.session.storage import damaged, read_text
 
-# --- OpenPose ------------------------------------------------------------------------------------------
+# --- OpenPose, and AlphaPose's formats `open` and `cmu` with a file for each picture -----------------------
+
+# The list of people of a picture and the keypoints of each, in AlphaPose's formats `open` and `cmu`.
+_BY_PICTURE = {"people": "pose_keypoints_2d", "bodies": "joints"}
 
 
 def _is_frame(content: object) -> bool:
-    return isinstance(content, dict) and isinstance(content.get("people"), list)
+    return isinstance(content, dict) and any(isinstance(content.get(key), list) for key in _BY_PICTURE)
 
 
 def _gather_openpose(people: Gathering) -> None:
@@ -41,9 +44,10 @@ def _gather_openpose(people: Gathering) -> None:
         if not isinstance(content, dict) or not _is_frame(content):
             people.dropped["file without a list of people"] += 1
         elif (frame := people.frame_of_file(file, _stem(file))) is not None:
-            for rank, (where, person) in enumerate(objects(content["people"], file, "people")):
+            key = next(key for key in _BY_PICTURE if key in content)
+            for rank, (where, person) in enumerate(objects(content[key], file, key)):
                 # The second name is that of versions until 2018.
-                if stated := person.get("pose_keypoints_2d") or person.get("pose_keypoints"):
+                if stated := person.get(_BY_PICTURE[key]) or person.get("pose_keypoints"):
                     track = person.get("person_id")
                     people.add(frame, triples(stated, where), where, rank=rank, own_id=_track(track))
     if people.count() == len(SKELETONS["body25"].joints):
@@ -77,9 +81,6 @@ def _order_of_25(keypoints: Float) -> str:
 
 
 # --- AlphaPose, old and new, also in its formats `cmu` and `open` --------------------------------------
-
-# The list of people of a picture and the keypoints of each, in AlphaPose's formats `open` and `cmu`.
-_BY_PICTURE = {"people": "pose_keypoints_2d", "bodies": "joints"}
 
 
 def _is_alphapose(content: object) -> bool:
