@@ -102,9 +102,11 @@ from pipelines.reconstruction.results import (
     write_figures,
 )
 from pipelines.reconstruction.solving import (
+    MIN_SIGMA_M,
     are_calibrated,
     noise_text,
     placed_by_size,
+    position_sigma_m,
     ray_sigma,
     refused_people,
     solver_for,
@@ -653,12 +655,13 @@ def _brought_together(
     flight: LoadedFlight, cameras: list[Camera], errors: Sequence[PoseErrors | None]
 ) -> tuple[list[Camera], list[str]]:
     """Shift cameras whose logs are metres off to where all see the person; say so."""
-    if len(cameras) < 2:
+    stated_m = [position_sigma_m(of) for of in errors]
+    if len(cameras) < 2 or max(stated_m) < MIN_SIGMA_M:
         return cameras, []
-    found = candidates(cameras, flight.between)
+    found, joints = candidates(cameras, flight.between), cameras[0].detections.joints
     hips = flight.actors[0].hips_at(found.t_ns) if flight.actors else None
     stature_m = flight.description.stature_m or STATURE_M[0]
-    shift = placed_by_size(cameras, found, errors, hips, stature_m=stature_m)
+    shift = placed_by_size(joints, found, stated_m, hips, stature_m)
     if not shift.any():
         return cameras, []
     moved = [

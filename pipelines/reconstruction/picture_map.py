@@ -20,6 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Index, Int64, Intrinsics, Picture
@@ -180,15 +181,12 @@ def key_rows(t_ns: Int64) -> Index:
     return np.unique(np.searchsorted(t_ns, wanted).clip(max=len(t_ns) - 1))
 
 
-def is_film(t_ns: Int64) -> bool:
-    """Test if pictures of these times [T] are near enough to follow points through them."""
-    return float(np.median(np.diff(t_ns))) <= MAX_FOLLOWED_STEP_S * 1e9
-
-
-def rows_of_film(t_ns: Int64, keys: Index) -> Index:
-    """Choose the rows of a film, of times [T], through which points are followed, with these key rows."""
-    step = max(1, round(1e9 / FOLLOWED_HZ / float(np.median(np.diff(t_ns)))))
-    return np.union1d(np.arange(0, len(t_ns), step), keys)
+def rows_of_film(t_ns: Int64, keys: Index) -> Index | None:
+    """Choose the rows of a film, of times [T], through which points are followed; None for photographs."""
+    step_s = float(np.median(np.diff(t_ns))) / 1e9
+    if step_s > MAX_FOLLOWED_STEP_S:
+        return None
+    return np.union1d(np.arange(0, len(t_ns), max(1, round(1 / FOLLOWED_HZ / step_s))), keys)
 
 
 def shrinkage(width: int, height: int) -> float:
@@ -198,8 +196,6 @@ def shrinkage(width: int, height: int) -> float:
 
 def shrunk(picture: Picture) -> Picture:
     """Return a picture, [H, W, 3] BGR or grey, in grey and at most `LONGER_SIDE_PX` long."""
-    import cv2
-
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     share = shrinkage(*grey.shape)
     if share < 1:
@@ -231,8 +227,6 @@ def followed_features(
 
 def features_of(picture: Picture, intrinsics: Intrinsics) -> KeyFeatures:
     """Find SIFT features in a photograph, [H, W, 3] BGR or grey."""
-    import cv2
-
     grey = shrunk(picture)
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, contrastThreshold=0.02)
     points, descriptors = sift.detectAndCompute(grey, None)
@@ -783,8 +777,3 @@ def poses_of_pictures(laid: LaidMap, t_ns: Int64, places: Float, at_ns: Int64) -
     known = (asked_s >= 0) & (asked_s <= key_s[-1]) & _bridged(laid.t_ns, at_ns)
     known &= np.isfinite(position).all(axis=1)
     return np.where(known[:, None], position, np.nan), np.where(known[:, None], quaternion, np.nan)
-
-
-def with_focal(intrinsics: Intrinsics, ratio: float) -> Intrinsics:
-    """Return intrinsics with a refined focal length."""
-    return replace(intrinsics, fx=intrinsics.fx * ratio, fy=intrinsics.fy * ratio)

@@ -198,57 +198,56 @@ MIN_SIGMAS_APART = 2.0
 MIN_MOMENTS = 5
 
 
+def position_sigma_m(errors: PoseErrors | None) -> float:
+    """Return the standard deviation per axis of a log's lasting position errors; 0 where nobody states it."""
+    lasting = [each.sigma0 for each in (errors.processes if errors else ()) if each.number != ROTATION]
+    return float(np.linalg.norm(lasting))
+
+
 def placed_by_size(
-    cameras: Sequence[Camera],
-    found: Candidates,
-    errors: Sequence[PoseErrors | None],
-    hips: Float | None,
-    *,
-    stature_m: float,
+    joints: Sequence[str], found: Candidates, stated_m: Sequence[float], hips: Float | None, stature_m: float
 ) -> Float:
-    """Estimate constant position errors so large that rays of different cameras do not meet at all.
+    """Estimate lasting position errors so large that rays of different cameras do not meet at all.
 
     Each camera by itself sees the person as far away as the person is tall in its pictures. The places that
     cameras see are brought together, each camera by as much as its stated error allows.
 
     Args:
-        cameras: C of them, with attitudes that are known.
-        found: their detections at T times.
-        errors: what is known of each log's errors.
+        joints: names of the J joints.
+        found: detections at T times by C cameras with attitudes that are known.
+        stated_m: [C] standard deviations of their positions' lasting errors.
         hips: [T, 3] m of a logged person; None without.
         stature_m: the person's.
 
     Returns:
-        Shifts [C, 3] m of the positions; 0 where errors are stated to be small, or the places agree.
+        Shifts [C, 3] m of the positions; 0 where the places agree.
     """
-    joints, nothing = cameras[0].detections.joints, np.zeros((len(cameras), 3))
-    constant_m = [
-        max((each.sigma0 for each in of.processes if each.constant and each.number != ROTATION), default=0.0)
-        for of in (each or PoseErrors((0.0, 0.0), ()) for each in errors)
-    ]
-    if max(constant_m) < MIN_SIGMA_M or not {"nose", "left_ankle", "right_ankle"} <= {*joints}:
+    nothing = np.zeros((len(stated_m), 3))
+    if not {"nose", "left_ankle", "right_ankle"} <= {*joints}:
         return nothing
-    surest = found.confidence.sum(axis=3).argmax(axis=2)[:, :, None, None]
-    rays = np.take_along_axis(found.rays, surest[..., None], axis=2)[:, :, 0]
-    ends = np.stack([rays[:, :, [joints.index(f"{side}_ankle") for side in ("left", "right")]].mean(axis=2),
-                     rays[:, :, joints.index("nose")]], axis=2)  # fmt: skip
-    ends = np.einsum("tcij,tckj->tcki", found.rotation, np.insert(ends, 2, 1.0, axis=-1))
+    surest = found.confidence.sum(axis=3).argmax(axis=2)[:, :, None, None, None]
+    rays = np.take_along_axis(found.rays, surest, axis=2)[:, :, 0]
+    left, right, nose = (rays[:, :, joints.index(name)] for name in ("left_ankle", "right_ankle", "nose"))
+    ends = np.insert(np.stack([(left + right) / 2, nose], axis=2), 2, 1.0, axis=-1)
+    ends = np.einsum("tcij,tckj->tcki", found.rotation, ends)
     # Ankles and nose are one above the other: distances along both rays by least squares.
     lines = np.stack([-ends[:, :, 0], ends[:, :, 1]], axis=-1)
     far = np.linalg.pinv(np.nan_to_num(lines)) @ np.array([0.0, 0.0, NOSE_TO_ANKLES * stature_m])
     away = (far[..., None] * ends).mean(axis=2)
     away[(far <= 0).any(axis=2)] = np.nan
     places = found.position + away
-    sigma_m = DISTANCE_SIGMA_SHARE * np.nanmedian(np.linalg.norm(away, axis=2), axis=0)
     if hips is not None:
         places = np.concatenate([places, hips[:, None]], axis=1)
-        sigma_m, constant_m = np.append(sigma_m, LOGGED_PERSON_SIGMA_M), [*constant_m, 0.0]
     rows = np.isfinite(places).all(axis=(1, 2))
     if rows.sum() < MIN_MOMENTS:
         return nothing
+    sigma_m = DISTANCE_SIGMA_SHARE * np.median(np.linalg.norm(away[rows], axis=2), axis=0)
+    constant_m = np.array(stated_m)
+    if hips is not None:
+        sigma_m, constant_m = np.append(sigma_m, LOGGED_PERSON_SIGMA_M), np.append(constant_m, 0.0)
     apart = np.median(places[rows] - places[rows].mean(axis=1, keepdims=True), axis=0)
     variance = np.square(constant_m) + np.square(sigma_m)
     apart -= (apart / variance[:, None]).sum(axis=0) / (1 / variance).sum()
     if (np.linalg.norm(apart, axis=1) < MIN_SIGMAS_APART * sigma_m).all():
         return nothing
-    return np.asarray(-(np.square(constant_m) / variance)[:, None] * apart)[: len(cameras)]
+    return np.asarray(-(np.square(constant_m) / variance)[:, None] * apart)[: len(stated_m)]

@@ -26,14 +26,12 @@ from pipelines.reconstruction.picture_map import (
     PictureMap,
     features_of,
     followed_features,
-    is_film,
     key_rows,
     lay_on_places,
     map_pictures,
     poses_of_pictures,
     rows_of_film,
     shrunk,
-    with_focal,
 )
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.description import PictureMapEntry
@@ -179,9 +177,10 @@ def turned_by_pictures(
                 else f" {found.focal_ratio * intrinsics.fx:.0f} px by its pictures"
             )
         )
+    ratio = found.focal_ratio
     return TurnedByPictures(
         replace(places, t_ns=frames.t_ns[known], position=position[known], quaternion_xyzw=turned[known]),
-        with_focal(intrinsics, found.focal_ratio),
+        replace(intrinsics, fx=ratio * intrinsics.fx, fy=ratio * intrinsics.fy),
         _with_rotation(stated, laid),
         found,
         entry,
@@ -217,7 +216,7 @@ def _unlike_log(name: str, laid: LaidMap, logged: Trajectory, note: Callable[[st
 def _features(
     film: FilmOfCamera, frames: CameraFrames, keys: Index, intrinsics: Intrinsics, progress: Progress
 ) -> list[KeyFeatures]:
-    followed = rows_of_film(frames.pts_ns, keys) if is_film(frames.pts_ns) else None
+    followed = rows_of_film(frames.pts_ns, keys)
     rows = keys if followed is None else followed
     follower, features = Follower(), []
     progress.start("Mapping by pictures", len(rows))

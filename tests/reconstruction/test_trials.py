@@ -10,7 +10,6 @@ import pytest
 from scipy.stats import t
 
 from pipelines.geometry.arrays import Intrinsics
-from pipelines.geometry.noise import Bias, pose_errors
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.reconstruction.loading import PoseDisturbance, disturbed
 from pipelines.reconstruction.observations import Camera, Candidates
@@ -62,14 +61,13 @@ def test_cameras_that_are_metres_off_start_where_people_have_their_size() -> Non
     each = seen[:, None, :, :2] / seen[:, None, :, 2:], np.ones((2, 1, 3)), at + off, rotation
     every = [np.tile(part, (times, *(1,) * part.ndim)) for part in each]
     found = Candidates(np.arange(times), np.zeros((times, 2), np.int64), *every)
-    named = replace(camera("drone1").detections, joints=("nose", "left_ankle", "right_ankle"))
-    cameras = [replace(camera("drone1"), detections=named), camera("drone2")]
-    wide, narrow = (2 * [pose_errors([Bias(position_m=size_m)])] for size_m in (50.0, 0.5))
-    left = placed_by_size(cameras, found, wide, None, stature_m=1.7) + off
+    joints = ("nose", "left_ankle", "right_ankle")
+    left = placed_by_size(joints, found, [50.0, 50.0], None, 1.7) + off
     assert np.ptp(left, axis=0).max() < 0.1  # all are off alike
     hips = np.tile([0.0, 0.0, 0.77], (times, 1))
-    assert np.abs(placed_by_size(cameras, found, wide, hips, stature_m=1.7) + off).max() < 0.1
-    assert not placed_by_size(cameras, found, narrow, hips, stature_m=1.7).any()
+    assert np.abs(placed_by_size(joints, found, [50.0, 50.0], hips, 1.7) + off).max() < 0.1
+    near = replace(found, position=found.position - 0.9 * off)
+    assert not placed_by_size(joints, near, [50.0, 50.0], hips, 1.7).any()
 
 
 @pytest.mark.parametrize(
