@@ -37,6 +37,7 @@ from pipelines.session.description import (
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, CameraSources, Manifest, read_flight, shape_file
 from pipelines.session.maps import store_map
+from pipelines.session.people import joint_called
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import recognise
 from pipelines.session.records import JointMotion, Occupancy, Trajectory
@@ -457,7 +458,10 @@ class _FlightReader:
             self._notes.append(f"truth: positions dropped: {losses(motion.dropped)}")
         if missing > sum(motion.dropped.values()):
             self._notes.append(f"truth: {missing} of {is_missing.size} positions of joints are missing")
-        if not {"hip"} & set(motion.joints) and not {"left_hip", "right_hip"} <= set(motion.joints):
+        if not any(map(joint_called, motion.joints)):
+            named = ", ".join(motion.joints[:5])
+            self._notes.append(f"truth: no name of its joints is known ({named}): no error is measured")
+        elif not {"hip"} & set(motion.joints) and not {"left_hip", "right_hip"} <= set(motion.joints):
             self._notes.append(
                 "truth: has no hip, nor left_hip and right_hip: errors relative to the root are not measured"
             )

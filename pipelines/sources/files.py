@@ -1,5 +1,7 @@
 """Files that a manifest names for one flight: their formats, and readers in the files' axes and times."""
 
+import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256
@@ -22,6 +24,7 @@ from pipelines.session.manifest import (
     TruthSource,
     options_of,
 )
+from pipelines.session.people import joint_called
 from pipelines.session.progress import Progress
 from pipelines.session.recognition import recognise, recognise_any
 from pipelines.session.records import CalibratedCamera, Detections, JointMotion, VideoIndex
@@ -41,7 +44,7 @@ from pipelines.session.registries import (
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
 from pipelines.session.urls import fetched, located, named, source_url
 from pipelines.session.yaml_models import YamlModel
-from pipelines.sources.world import UP_ROWS, losses
+from pipelines.sources.world import METRES, UP_ROWS, losses
 
 # In any flight a person's joints are closer to their median than this.
 MAX_JOINT_DISTANCE_M = 10_000
@@ -192,12 +195,12 @@ class FlightFiles:
         size_m = _body_size_m(motion)
         if np.isnan(size_m) or low_m <= size_m <= high_m:
             return
-        for unit in ("m", "cm", "mm"):
+        for unit in METRES:
             other = _of_subject(path, reader.read_joints(path, unit=unit, axes=axes), source.subject)
             other_m = _body_size_m(_without_zeros(other))
             if low_m <= other_m <= high_m:
                 problem = (
-                    f"holds people of {size_m:.1f} m by its unit, and of {other_m:.2g} m if it is {unit}"
+                    f"holds people of {size_m:.4g} m by its unit, and of {other_m:.2g} m if it is {unit}"
                 )
                 raise DataError(path, problem, f"say truth: {{unit: {unit}}}", code="unit-unknown")
 
@@ -215,13 +218,16 @@ def _timed(path: Path, motion: JointMotion, source: TruthSource) -> JointMotion:
 
 
 def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMotion:
-    """Keep the joints of one subject, whose name stands before a colon in the names of its joints."""
-    parted = [joint.rpartition(":") for joint in motion.joints]
-    subjects = list(dict.fromkeys(name for name, colon, _ in parted if colon))
+    """Keep the joints of one subject, whose name stands before a separator in the names of its joints."""
+    parted = [_parted(joint) for joint in motion.joints]
+    count = Counter(name for name, _, _ in parted if name)
+    colons = {name for name, separator, _ in parted if separator == ":"}
+    subjects = [name for name in count if name in colons or count[name] >= MIN_JOINTS_OF_A_BODY]
     if subject is None and len(subjects) < 2:
-        subject = subjects[0] if subjects and all(colon for _, colon, _ in parted) else None
-        if subject is None:
+        plain = [joint for name, _, joint in parted if not name]
+        if not subjects or (subjects[0] in colons and plain) or any(map(joint_called, plain)):
             return motion
+        subject = subjects[0]
     if subject not in subjects:
         problem = f"holds joints of {', '.join(subjects) or 'nobody by name'}"
         remedy = f"say which: truth: {{subject: {subjects[0]}}}" if subjects else "leave truth.subject out"
@@ -232,6 +238,16 @@ def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMo
         joints=joint_names(tuple(parted[k][2] for k in chosen)),
         position=motion.position[:, :, chosen],
     )
+
+
+def _parted(joint: str) -> tuple[str, str, str]:
+    """Part a name into subject, separator and joint; other separators than colons stand before known joints."""
+    if ":" in joint or joint_called(joint):
+        return joint.rpartition(":")
+    found = (
+        (joint[: at.start()], at.group(), joint[at.end() :]) for at in re.finditer(r"[_. |/-]", joint)
+    )
+    return next((parts for parts in found if parts[0] and joint_called(parts[2])), ("", "", joint))
 
 
 def _without_zeros(motion: JointMotion) -> JointMotion:
@@ -271,8 +287,8 @@ def _without_far_joints(motion: JointMotion) -> JointMotion:
 
 # A body that few joints stand for may be of any size.
 MIN_JOINTS_OF_A_BODY = 8
-# The diagonal of the box around a person's joints: curled up, and tall with raised arms.
-BODY_SIZE_M = (0.4, 3.0)
+# The diagonal of the box around a person's joints: a crouching child, and somebody tall with raised arms.
+BODY_SIZE_M = (0.65, 3.0)
 
 
 def hash_sources(flight: Manifest, base: Path, progress: Progress) -> dict[str, str]:

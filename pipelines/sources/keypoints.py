@@ -20,16 +20,18 @@ _MAX_SHARE = 2.0
 _MAX_NEGATIVE_SHARE = 0.05
 # People do not stand still to the last digit of 3 joints for this long, so the detector repeats itself.
 _MAX_REPEAT_S = 0.3
-# Where most detections repeat, nothing in the file moves: they may be right, and are kept.
-_MAX_REPEATED_SHARE = 0.5
+# Where nearly all detections repeat, nothing in the file moves: they may be right, and are kept.
+_MAX_REPEATED_SHARE = 0.9
 
 
 def without_zeros(detections: Detections) -> Detections:
-    """Take joints at exactly (0, 0) as missing, as many programs write them; count them."""
-    zero: Bool = np.asarray((detections.xy == 0.0).all(axis=-1))
-    if not zero.any():
-        return detections
-    return _without(zero, detections, {"joints at exactly 0, 0, taken as missing": int(zero.sum())})
+    """Take joints at exactly (0, 0) or (-1, -1) as missing, as many programs write them; count them."""
+    for number in (0, -1):
+        same: Bool = np.asarray((detections.xy == number).all(axis=-1))
+        if same.any():
+            lost = {f"joints at exactly {number}, {number}, taken as missing": int(same.sum())}
+            detections = _without(same, detections, lost)
+    return detections
 
 
 def in_pixels(detections: Detections, intrinsics: Intrinsics, source: str) -> Detections:
@@ -81,13 +83,13 @@ def without_repeats(detections: Detections, frames: CameraFrames) -> tuple[Detec
 
 def doubt_numbers(detections: Detections, frames: CameraFrames, *, from_video: bool) -> str | None:
     """Return a doubt if keypoints seem to be numbered from 1; None without one."""
-    first, last = int(detections.frame[0]), int(detections.frame[-1])
+    first, last = int(detections.frames_listed[0]), int(detections.frames_listed[-1])
     if from_video and first >= 1 and last == int(frames.frame[-1]) + 1:
         return (
             f"its keypoints are numbered up to {last}, its pictures up to {frames.frame[-1]}: the"
             " keypoints count from 1, so write `first_frame: 1` in `keypoints`"
         )
-    if not from_video and int(detections.frames_listed[0]) == 1:
+    if first == 1:
         return (
             "its keypoints begin with 1: if this is the first picture, write `first_frame: 1` in `keypoints`"
         )

@@ -13,6 +13,8 @@ from pipelines.session.records import Trajectory
 _MOMENTS = 60
 # No team films one person from places that are farther apart.
 _ONE_FLIGHT_M = 5000.0
+# Cameras that film one person together are nearer to each other than this.
+_TEAM_M = 200.0
 # Eastings of UTM begin at 166 km, so positions beyond this are projected ones.
 _PROJECTED_M = 100_000.0
 # No drone that films people flies faster than this.
@@ -46,6 +48,18 @@ def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Fl
     """
     middle = {name: np.median(track.position, axis=0) for name, track in cameras.items()}
     doubts = []
+    all_far = [_apart_m(*two) for two in combinations(middle.values(), 2)]
+    if all_far and _ONE_FLIGHT_M < min(all_far) <= max(all_far) < _TEAM_M / _UNITS_M["mm"]:
+        doubts.append(
+            Doubt(
+                code="unit",
+                cameras=list(middle),
+                what="all cameras are kilometres apart: their positions are in mm",
+                evidence={"apart_m": round(min(all_far), 1)},
+                remedy="; ".join(f"cameras.{name}.pose.unit: mm" for name in middle),
+            )
+        )
+        middle = {}
     for name, place in middle.items():
         others = [other for key, other in middle.items() if key != name]
         if not others or min(_apart_m(place, other) for other in others) < _ONE_FLIGHT_M:
@@ -59,7 +73,7 @@ def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Fl
             Doubt(
                 code="unit" if unit else "origin",
                 cameras=[name],
-                what=f"{name} flies far from the others: {reason}",
+                what=f"{name} is far from the others: {reason}",
                 evidence={"apart_m": round(min(_apart_m(place, other) for other in others), 1)},
                 remedy=f"cameras.{name}.pose.{remedy}",
             )

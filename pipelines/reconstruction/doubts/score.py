@@ -496,9 +496,9 @@ def score(
     if base is not None and reference is not None:
         floor, top = SCATTER_RANGE
         # In the same pixels, keypoints scatter as much; a wrong focal length bends what little they do.
-        floor = min(floor, reference) if np.array_equal(scene.person_px, base.person_px) else floor
-        least = np.clip(reference, SCATTER_RANGE[0], top) if scatter < reference else max(reference, floor)
-        total += SCATTER_WEIGHT * float(np.log(np.clip(scatter, floor, top) / least))
+        if scatter > reference and np.array_equal(scene.person_px, base.person_px):
+            floor = min(floor, reference)
+        total += SCATTER_WEIGHT * float(np.log(np.clip(scatter, floor, top) / np.clip(reference, floor, top)))
         if total > limit:
             return Score(total, misfit, scatter, {"behind": behind}, np.nan)
     body = Body(solved.joints)
