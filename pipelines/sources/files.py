@@ -241,12 +241,10 @@ def _of_subject(path: Path, motion: JointMotion, subject: str | None) -> JointMo
 
 
 def _parted(joint: str) -> tuple[str, str, str]:
-    """Part a name into subject, separator and joint; other separators than colons stand before known joints."""
+    """Part a name into subject, separator and joint, which is a known one but after a colon."""
     if ":" in joint or joint_called(joint):
         return joint.rpartition(":")
-    found = (
-        (joint[: at.start()], at.group(), joint[at.end() :]) for at in re.finditer(r"[_. |/-]", joint)
-    )
+    found = ((joint[: at.start()], at.group(), joint[at.end() :]) for at in re.finditer(r"[_. |/-]", joint))
     return next((parts for parts in found if parts[0] and joint_called(parts[2])), ("", "", joint))
 
 

@@ -25,11 +25,13 @@ from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import (
     JOINTS,
     STATURE_M,
+    Body,
     Sampled,
     SceneOfMoments,
     scene_of,
     trunk_direction,
 )
+from pipelines.reconstruction.doubts.score import FEW, PLACED_M, solve
 from pipelines.reconstruction.observations import Filmed
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
@@ -81,6 +83,7 @@ class Alternative:
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
     alike: bool = False  # of times of all cameras
+    flight: Sampled | None = None  # where a map and an actor are other than described
 
 
 @dataclass(frozen=True)
@@ -247,21 +250,53 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     )
 
 
-def scale(trial: Trial, stature: float) -> Alternative:
-    """Scale all positions so that the person has a usual stature: rays that fit go on fitting."""
+def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]:
+    """Scale all positions so that the person has a usual stature: rays that fit go on fitting.
+
+    What else is placed in the world, as a map or an actor, is scaled with them, or is right as it is. The
+    truth, if there is one, says which line changes no more than is wrong.
+    """
+    flight, described = trial.flight, trial.described
     # Any scale makes the person as tall as people are: that much surer the stature makes it (see `_freedom`).
-    factor, code, price = STATURE_M / stature, "scale", PRICE_OF_ALL + np.log(1 / STATURE_SHARE) / 2
-    what = f"all positions are {1 / factor:.2g} times what they should be: the person is {stature:.3g} m tall"
-    remedy, evidence = f"world.scale: {factor:.3g}", {"scale_sigma_share": STATURE_SHARE}
-    for unit, metres in _UNITS_M.items():
-        if abs(np.log(factor / metres)) < STATURE_SHARE:
-            factor, code, evidence, price = metres, "unit", {}, PRICE_OF_ALL
+    price = PRICE_OF_ALL + np.log(1 / STATURE_SHARE) / 2 + dearer
+    size = STATURE_M / stature
+    by_actor, sigma = _scaled_to_actor(trial, size)
+    unit = next((name for name, m in _UNITS_M.items() if abs(np.log(by_actor / m)) < STATURE_SHARE), None)
+    alone = unit is not None
+    if flight.truth_m is not None:
+        alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
+    located = flight.truth_m is None and (flight.hips is not None or flight.ground is not None)
+    for of_poses in (alone, not alone) if located else (alone,):
+        factor, code, cost, remedy = size, "scale", price, f"world.scale: {size:.3g}"
+        placed, evidence = flight.scaled(size), {"scale_sigma_share": STATURE_SHARE}
+        if of_poses:
+            factor, remedy, placed = by_actor, remedies.scaled(trial.cameras, by_actor), flight
+            evidence["scale_sigma_share"] = round(sigma, 3)
+        what = f"all positions are {1 / factor:.2g} times what they should be:"
+        what += f" the person is {stature:.3g} m tall"
+        if of_poses and unit is not None:
+            factor, code, evidence, cost = _UNITS_M[unit], "unit", {}, PRICE_OF_ALL
             what, remedy = f"the positions are in {unit}", remedies.unit(trial.cameras, unit)
-    # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
-    of_places = np.array([factor, 1.0] * 3)
-    described = trial.described
-    scene = replace(described, position=described.position * factor, sigma=described.sigma * of_places)
-    return Alternative(code, trial.names, what, remedy, price, scene, same_scatter=True, evidence=evidence)
+        # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
+        of_places = np.array([factor, 1.0] * 3)
+        scene = replace(described, position=described.position * factor, sigma=described.sigma * of_places)
+        yield Alternative(code, trial.names, what, remedy, cost, scene, True, evidence, flight=placed)
+
+
+def _scaled_to_actor(trial: Trial, size: float) -> tuple[float, float]:
+    """Return the factor of all positions that the stature and a logged actor show, and its relative error."""
+    if trial.flight.hips is None:
+        return size, STATURE_SHARE
+    hips = Body(solve(trial.described).joints).hips
+    known = np.isfinite(hips + trial.flight.hips).all(axis=1)
+    far2 = float((hips[known] ** 2).sum())
+    factor = float((hips * trial.flight.hips)[known].sum()) / max(far2, 1e-9)
+    if factor <= 0:
+        return size, STATURE_SHARE
+    # As for fits: an actor's errors wander, and count as few.
+    weights = np.array([1 / STATURE_SHARE**2, FEW * factor**2 * far2 / known.sum() / PLACED_M**2])
+    found = float(np.exp(weights @ np.log([size, factor]) / weights.sum()))
+    return found, float(1 / np.sqrt(weights.sum()))
 
 
 # --- alternatives without a number -----------------------------------------------------------------------

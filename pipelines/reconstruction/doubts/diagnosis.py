@@ -19,7 +19,15 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.reconstruction.doubts import alternatives, remedies
 from pipelines.reconstruction.doubts.alternatives import PRICE_OF_ALL, RATES, Alternative, Numbers, Trial
 from pipelines.reconstruction.doubts.logs import doubts_of_logs
-from pipelines.reconstruction.doubts.scene import STATURE_M, Sampled, SceneOfMoments, sample, scene_of
+from pipelines.reconstruction.doubts.scene import (
+    JOINTS,
+    STATURE_M,
+    Sampled,
+    SceneOfMoments,
+    sample,
+    scene_of,
+    stature_m,
+)
 from pipelines.reconstruction.doubts.score import (
     Base,
     Fit,
@@ -34,6 +42,7 @@ from pipelines.reconstruction.doubts.score import (
     unposed,
 )
 from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
+from pipelines.reconstruction.loading import load_truth
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt
 from pipelines.session.maps import each_map
@@ -67,7 +76,7 @@ STRANGE = 5.0
 """Standard deviations from which one oddity is said, whatever the score."""
 
 STRANGE_SIZE = 2.5
-"""The same of the stature: mistakes of scale are less rare than people below 1.27 m or above 2.35 m."""
+"""The same of the stature: mistakes of scale are less rare than people below 1.27 m or above 2.12 m."""
 
 DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no alternative explains it."""
@@ -133,7 +142,12 @@ def doubts_of(
     turns = all_turns(cameras, followed)
     first_ns = [description.cameras[camera.name].frames.first_t_ns for camera in cameras]
     late = lateness(cameras, turns, description.pose_interpolation, RATES, first_ns)
-    return diagnose(_less_odd(known(chosen=chosen), known()), late)
+    flight = _less_odd(known(chosen=chosen), known())
+    truth = load_truth(folder, description, JOINTS)
+    if flight is not None and truth is not None:
+        size_m = stature_m(truth.position[:, 0])
+        flight = flight._replace(truth_m=size_m if np.isfinite(size_m) else None)
+    return diagnose(flight, late)
 
 
 def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, float | str]]) -> list[Doubt]:
@@ -192,8 +206,9 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     if odd:
         tried += map(objective.scored, alternatives.discrete(trial))
         tried += map(objective.with_numbers, alternatives.numbers_of_all(trial))
-    if strange and np.isfinite(found.stature_m):
-        tried.append(objective.scored(alternatives.scale(trial, found.stature_m)))
+    if odd and found.stature_m > 0:
+        dearer = 0.0 if found.odd["size"].sigmas >= STRANGE_SIZE else MARGIN
+        tried += map(objective.scored, alternatives.scales(trial, found.stature_m, dearer))
     if odd or objective.described.strain >= STRAINED:
         tried += map(objective.with_numbers, alternatives.numbers_of_one(trial))
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
@@ -277,8 +292,8 @@ class Objective:
         self._pictures = np.isfinite(trial.described.rays[..., 0]).any(axis=-1).sum(axis=1)  # [C]
         self.described = self._fit(trial.described)
 
-    def _fit(self, scene: SceneOfMoments) -> Fit:
-        return fit(self.trial.flight, lambda _: scene)
+    def _fit(self, scene: SceneOfMoments, flight: Sampled | None = None) -> Fit:
+        return fit(flight or self.trial.flight, lambda _: scene)
 
     def scored(self, alternative: Alternative, cost: float = np.inf) -> Tried:
         """Score an alternative."""
@@ -287,7 +302,8 @@ class Objective:
         least = LEAST_GAIN_OF_TIMES if alternative.code in TIMES else -_SPARE
         limit = min(self.best_total + _SPARE, self.base.total - least)
         same = alternative.same_scatter
-        found = score(self.trial.flight, alternative.scene, self.base, same_scatter=same, limit=limit)
+        flight = alternative.flight or self.trial.flight
+        found = score(flight, alternative.scene, self.base, same_scatter=same, limit=limit)
         tried = Tried(alternative, found, cost)
         self.best_total = min(self.best_total, tried.total)
         return tried
@@ -363,7 +379,7 @@ class Objective:
             same = replace(described, rays=np.where(seen, described.rays, np.nan))
             before = self._fit(same).cost
             total = min(total, score(self.trial.flight, same, self.base).total)
-        cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene).cost
+        cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
         if tried.alternative.alike:
             # Then each moment is of another picture, with other errors: sums of chi^2 differ by chance.
             chance = before * float(np.sqrt(2 / self._pictures.sum()))
@@ -414,7 +430,7 @@ def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
     """
     if alternative.scene is None:
         return True
-    found = score(flight, alternative.scene)
+    found = score(alternative.flight or flight, alternative.scene)
     return found.total < DOUBTFUL and not _is_strange(found)
 
 

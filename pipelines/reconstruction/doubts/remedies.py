@@ -145,13 +145,18 @@ def turned_world(cameras: Sequence[Filmed], up: Float) -> str:
     return _lines(cameras, range(len(cameras)), lambda camera: _placed(camera, np.zeros(3), turn))
 
 
-def _placed(camera: Filmed, shift: Float, turn: Float) -> str:
-    """State where the world of a camera's log lies, turned [3, 3] and moved [3] m from what is stated."""
+def scaled(cameras: Sequence[Filmed], factor: float) -> str:
+    """Scale the positions of every source of poses."""
+    return _lines(cameras, range(len(cameras)), lambda each: _placed(each, np.zeros(3), _EYE, factor))
+
+
+def _placed(camera: Filmed, shift: Float, turn: Float, factor: float = 1.0) -> str:
+    """State where the world of a log lies, turned [3, 3], moved [3] m and scaled from what is stated."""
     stated = camera.entry.poses.world_from_source
     half_rad = np.radians(stated.yaw_deg) / 2
     quaternion = stated.rotation_xyzw or (0.0, 0.0, np.sin(half_rad), np.cos(half_rad))
     rotation = quaternion_from_matrix(turn @ matrix_from_quaternion(np.array(quaternion)))
-    translation = np.round(shift + turn @ np.array(stated.translation), 2) + 0.0
+    translation = np.round(shift + factor * turn @ np.array(stated.translation), 2) + 0.0
     parts = [f"translation: {_vector(translation.tolist())}"] if translation.any() else []
     yaw_deg = float(np.degrees(2 * np.arctan2(rotation[2], rotation[3])))
     yaw_deg -= 360 * round(yaw_deg / 360)
@@ -159,7 +164,8 @@ def _placed(camera: Filmed, shift: Float, turn: Float) -> str:
         parts.append("rotation_xyzw: [" + ", ".join(f"{value:.5g}" for value in rotation) + "]")
     elif abs(yaw_deg) > 0.05:
         parts.append(f"yaw_deg: {yaw_deg:.1f}")
-    parts += [f"scale: {stated.scale:.6g}"] if stated.scale != 1 else []
+    scale = float(f"{factor:.3g}") * stated.scale
+    parts += [f"scale: {scale:.6g}"] if scale != 1 else []
     return f"pose.world_from_source: {{{', '.join(parts or ['translation: [0, 0, 0]'])}}}"
 
 

@@ -71,6 +71,14 @@ class Sampled(NamedTuple):
     second: Int64  # [T / 2]
     hips: Float | None  # [T, 3] m, logged; None without a logged actor
     ground: GroundOfMap | None
+    truth_m: float | None = None  # stature of the true joints, if there are any
+
+    def scaled(self, factor: float) -> Sampled:
+        """Scale the logged actor and the map."""
+        ground, hips = self.ground, self.hips
+        if ground is not None:
+            ground = GroundOfMap(factor * ground.corner, factor * ground.side_m, factor * ground.height)
+        return self._replace(hips=None if hips is None else factor * hips, ground=ground)
 
 
 class GroundOfMap(NamedTuple):
@@ -344,6 +352,8 @@ STATURE_M = 1.73
 _USUAL_SIZE = 0.08
 # Statures of grown-ups have this standard deviation of their logarithm.
 _SIZE_SIGMA = 0.09
+# Children are small; nobody is so tall. Keypoints make people 10 % shorter to 5 % taller than they are.
+_TALL_SIGMA = 0.05
 # Two moments farther apart than this do not tell the direction in which somebody walks.
 _WALK_NS = 1_000_000_000
 # Somebody who is slower than this over the flight does not walk.
@@ -445,8 +455,9 @@ class Body:
         length, share = self.lengths[worst]
         measured = {f"{names[worst]}_m": median(length), "usual_m": share * stature}
         beyond = max(0.0, abs(np.log(stature / STATURE_M)) - _USUAL_SIZE)
+        sigma = _TALL_SIGMA if stature > STATURE_M else _SIZE_SIGMA
         return {
-            "size": Oddity(beyond / _SIZE_SIGMA, {"stature_m": stature}),
+            "size": Oddity(beyond / sigma, {"stature_m": stature}),
             "shape": Oddity(min(float(np.nanmedian(off)), 5.0) / 0.10, measured),
         }
 

@@ -49,11 +49,11 @@ _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
 # Derivatives are taken over this step of m, rad and logarithms.
 _PROBE = 1e-4
 # The logged hips of an actor err by this much.
-_PLACED_M = 0.3
+PLACED_M = 0.3
 # Residuals beyond this many standard deviations count linearly.
 _HUBER = 1.5
 # Errors of a logged actor wander, and count as so many independent ones.
-_FEW = 3
+FEW = 3
 # A person is filmed from about this distance where none is known.
 _USUAL_M = 10.0
 # With fewer rays nothing can be fitted.
@@ -385,10 +385,10 @@ def picture_variance(scene: SceneOfMoments) -> Float:
 def _varying2(varying: Float, white: Float, times: int) -> Float:
     """Return the variance [C] of errors that vary, as of one of so many pictures with independent errors.
 
-    What is not new in every pose is worth `_FEW` independent pictures, however many there are.
+    What is not new in every pose is worth `FEW` independent pictures, however many there are.
     """
     lasting2 = np.maximum(varying**2 - white**2, 0.0)
-    variance: Float = white**2 + lasting2 * times / _FEW
+    variance: Float = white**2 + lasting2 * times / FEW
     return variance
 
 
@@ -402,7 +402,7 @@ def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]
     known = np.asarray(np.isfinite(apart).all(axis=-1))
     apart = np.where(known[..., None], apart, 0.0)
     # The way there counts besides the place: a log turned about its zero leads elsewhere.
-    each = _FEW / (_PLACED_M**2 * max(int(known.sum()), 1))
+    each = FEW / (PLACED_M**2 * max(int(known.sum()), 1))
     weight[:, hips] = each * known
     pull[:, hips] = each * apart
     return weight, pull, each * float((apart**2).sum())
