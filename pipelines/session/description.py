@@ -243,7 +243,10 @@ DOUBT_CODES = {
     "axes": ("The log is in NED, or its z or body axes differ.", "pose.axes, pose.z, mount"),
     "unit": ("Positions are in feet, centimetres or millimetres.", "pose.unit"),
     "level": ("The world's z does not point up.", "world.up, pose.world_from_source"),
-    "scale": ("All positions are larger or smaller than they should be.", "world.scale"),
+    "scale": (
+        "All positions are larger or smaller than they should be.",
+        "world.scale, pose.world_from_source",
+    ),
     "mount": ("The camera is rolled, looks another way, or tilts up instead of down.", "mount"),
     "gimbal": (
         "The angles of gimbals are in other axes, or relative to something else.",

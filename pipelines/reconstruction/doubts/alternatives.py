@@ -202,14 +202,18 @@ def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
 
 # --- the world -------------------------------------------------------------------------------------------
 
-# Up is where neither people nor cameras say, if both say another direction that is this far from z.
-LEAST_TILT_OF_WORLD_DEG = 40.0
 # The trunk of somebody who does more than lie or stand points elsewhere in some pictures.
 LEAST_STEADY_TRUNK = 0.7
-# Upper edges of pictures must be higher by this cosine along the other direction.
-LEAST_GAIN_OF_PICTURES = 0.25
-# A direction this near to an axis is that axis, since people lean.
+# People lean by this much, and cameras are rolled, beside what is stated of their attitudes.
+LEAN_DEG, ROLL_DEG = 10.0, 3.0
+# Pictures and people must be upright by so many squared standard deviations more along another direction.
+LEAST_GAIN_OF_UP = 25.0
+# A direction this near to an axis is that axis, since people lean: so the world is no less tilted than this.
 AXIS_WITHIN_DEG = 12.0
+# Upper edges of pictures are lower by at most this cosine along the other direction, as cameras look down.
+MOST_LOSS_OF_EDGES = 0.25
+# Directions about the trunk are searched so far, which is farther than people lean.
+_SEARCHED = np.tan(np.radians(np.arange(-24.0, 25.0, 2.0)))
 # Two in three grown-ups have a stature within this share of the usual one.
 STATURE_SHARE = 0.09
 _UPS = {
@@ -220,20 +224,36 @@ _UPS = {
 
 
 def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
-    """Find a world whose z does not point up: people stand, and pictures are upright, along another axis.
+    """Find a world whose z does not point up: people and pictures are upright along another direction.
 
     Both must say so: somebody may lie, and a camera may be rolled or look straight down.
     """
-    up = trunk_direction(joints)
-    steady = float(np.linalg.norm(up))
+    trunk = trunk_direction(joints)
+    steady = float(np.linalg.norm(trunk))
     if not steady > LEAST_STEADY_TRUNK:
         return
-    up = up / steady
-    tilt_deg = float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
-    edge = -trial.described.rotation[..., 1].reshape(-1, 3)  # of each picture, upwards
-    higher = (edge @ (up - [0.0, 0.0, 1.0]))[np.isfinite(edge).all(axis=1)]
-    gain = float(higher.mean()) if len(higher) else 0.0
-    if tilt_deg < LEAST_TILT_OF_WORLD_DEG or gain < LEAST_GAIN_OF_PICTURES:
+    trunk, z = trunk / steady, np.array([0.0, 0.0, 1.0])
+    across = np.linalg.svd(trunk[None])[2][1:]
+    about = np.stack(np.meshgrid(_SEARCHED, _SEARCHED), axis=-1).reshape(-1, 2) @ across
+    ups = np.vstack([z, (trunk + about) / np.linalg.norm(trunk + about, axis=1, keepdims=True)])
+    rotation = trial.described.rotation
+    rolls2 = np.nanmean((rotation[..., 0] @ ups.T) ** 2, axis=1)  # [C, U]
+    sigma2 = np.radians(ROLL_DEG) ** 2 + trial.described.sigma[:, 1] ** 2
+    cost = (rolls2 / sigma2[:, None]).sum(axis=0) + ((ups - trunk) ** 2).sum(axis=1) / np.radians(
+        LEAN_DEG
+    ) ** 2
+    up = ups[np.argmin(cost)]
+    tilt_deg, of_trunk_deg, left_deg = (
+        float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) for cosine in (up @ z, trunk @ z, trunk @ up)
+    )
+    lost = float(np.nanmean(-rotation[..., 1] @ (z - up)))
+    gain = float(cost[0] - cost.min())
+    if (
+        tilt_deg < AXIS_WITHIN_DEG
+        or gain < LEAST_GAIN_OF_UP
+        or left_deg > of_trunk_deg / 2
+        or lost > MOST_LOSS_OF_EDGES
+    ):
         return
     axis = max(_UPS, key=lambda name: float(_UPS[name] @ up))
     beside_deg = float(np.degrees(np.arccos(np.clip(_UPS[axis] @ up, -1, 1))))
@@ -246,7 +266,11 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
         f"the world's z does not point up: people and pictures are upright {tilt_deg:.0f} deg from it",
         remedy,
         0.0,
-        evidence={"tilt_deg": round(tilt_deg, 1), "beside_axis_deg": round(beside_deg, 1)},
+        evidence={
+            "tilt_deg": round(tilt_deg, 1),
+            "beside_axis_deg": round(beside_deg, 1),
+            "gain": round(gain, 1),
+        },
     )
 
 
@@ -588,7 +612,8 @@ NUMBERS = {"shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 
 focal length is another; the number is then the logarithm of the factor.
 """
 
-_OF_ALL = ("focal", "pitch", "heading")
+# Prices of what all cameras have in common. Right positions with headings that are all wrong are rare.
+_OF_ALL = {"focal": PRICE_OF_ALL, "pitch": PRICE_OF_ALL, "heading": 3.0}
 # A fit finds the best angle from within some 10 deg; those that are not here are tried all around.
 _STARTS_DEG = {"pitch": range(-90, 91, 15), "focal": (0,), "shift": (0,)}
 
@@ -708,7 +733,7 @@ def _of_numbers(
         evidence["shift_sigma_m"] = round(float(np.sqrt(variance[:3].sum())), 2)
     if kind not in ("shift", "focal") and variance.size:
         evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
-    price = PRICE_OF_ONE if len(group) < len(trial.names) else PRICE_OF_ALL
+    price = PRICE_OF_ONE if len(group) < len(trial.names) else _OF_ALL[kind]
     named = trial.named(group, of_pair=not mounted)
     return Alternative(code, named, what, remedy, price, evidence=evidence)
 

@@ -206,12 +206,12 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     if odd:
         tried += map(objective.scored, alternatives.discrete(trial))
         tried += map(objective.with_numbers, alternatives.numbers_of_all(trial))
-    if odd and found.stature_m > 0:
-        dearer = 0.0 if found.odd["size"].sigmas >= STRANGE_SIZE else MARGIN
-        tried += map(objective.scored, alternatives.scales(trial, found.stature_m, dearer))
     if odd or objective.described.strain >= STRAINED:
         tried += map(objective.with_numbers, alternatives.numbers_of_one(trial))
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
+    if "size" in found.odd and (odd or objective.described.strain >= STRAINED):
+        dearer = 0.0 if found.odd["size"].sigmas >= STRANGE_SIZE else MARGIN
+        tried += map(objective.scored, alternatives.scales(trial, found.stature_m, dearer))
     # Times come last, since most of them need no exact score beside what fits by then.
     tried += map(objective.scored, alternatives.rates(trial))
     tried += [objective.best_clock([index]) for index in trial.every]
@@ -245,6 +245,7 @@ class Tried(NamedTuple):
     score: Score | None = None  # None of what is seen directly
     cost: float = np.inf  # of what is fitted: chi^2 of the rays, and what the numbers cost
     misfits: tuple[float, float] = (np.nan, np.nan)  # the objective of the description, and with this change
+    numbers: int = 0  # how many were fitted
 
     @property
     def total(self) -> float:
@@ -269,10 +270,12 @@ class Compared(NamedTuple):
         """Test if the gain is more than chance.
 
         People who lie or stand look alike at all times. So where nothing is odd, and of times of all cameras,
-        the rays alone must tell it; of times of one camera, they must fit as well.
+        the rays alone must tell it; of times of one camera, they must fit as well, or tell it if nothing else
+        does.
         """
         if alternative.code in TIMES:
-            least = MARGIN if alternative.alike else -_ALIKE
+            by_score = self.score_before - self.score_after >= LEAST_GAIN_OF_TIMES
+            least = -_ALIKE if by_score and not alternative.alike else MARGIN
         else:
             least = -np.inf if odd else MARGIN
         # Whoever is far too tall or small is doubted anyway.
@@ -343,7 +346,8 @@ class Objective:
             return None
         size, normal = alternatives.sizes(found.numbers), np.linalg.pinv(found.covariance)
         surer = float(np.linalg.slogdet(np.eye(len(size)) + size[:, None] * normal * size)[1])
-        return self.scored(replace(alternative, scene=found.scene), found.cost + surer + _OF_ANY_SIZE)
+        tried = self.scored(replace(alternative, scene=found.scene), found.cost + surer + _OF_ANY_SIZE)
+        return tried._replace(numbers=len(size))
 
     def with_noise(self, tried: Sequence[Alternative]) -> Tried:
         """Take the factor of larger errors that fits best."""
@@ -391,19 +395,18 @@ class Objective:
 def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tried]:
     """Return the alternatives that lower the objective next to most, one of each code; none if by too little.
 
-    Those without a free number are first. What leaves something odd is no cause.
+    Of each code the one with the fewest numbers is taken; those without one are first. What leaves
+    something odd is no cause.
     """
 
     def without_rays(each: Tried) -> float:
         scene = each.alternative.scene
         return each.total + (0.0 if scene is None else surprise(unposed(scene)))
 
-    by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=without_rays)
     most = objective.base.total + surprise(unposed(objective.trial.described)) - LEAST_GAIN_OF_TIMES
+    by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=without_rays)
     by_score = [
-        each
-        for each in by_score[:_FITTED]
-        if each.alternative.code not in TIMES or without_rays(each) <= most
+        each for each in by_score[:_FITTED] if not each.alternative.alike or without_rays(each) <= most
     ]
     weighed = []
     for each in [*by_score, *(each for each in tried if np.isfinite(each.cost))]:
@@ -418,8 +421,11 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tri
             break
         if _leaves_no_doubt(objective.trial.flight, each.alternative):
             causes.append((gain, each))
-    causes.sort(key=lambda pair: (np.isfinite(pair[1].cost), -pair[0]))
-    return list({each.alternative.code: each for _, each in reversed(causes)}.values())[::-1]
+    simplest: dict[str, tuple[float, Tried]] = {}
+    for gain, each in sorted(causes, key=lambda pair: pair[1].numbers):
+        simplest.setdefault(each.alternative.code, (gain, each))
+    by_gain = sorted(simplest.values(), key=lambda pair: (pair[1].numbers > 0, -pair[0]))
+    return [each for _, each in by_gain]
 
 
 def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
