@@ -59,7 +59,8 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
     say_warnings(result.warnings, shown.quiet)
     if assumed:
         listed = "; ".join(map(one_line, assumed))
-        say(f"{len(assumed)} assumptions, marked in {manifest}: {listed}", err=True)
+        count = f"{len(assumed)} assumption{'' if len(assumed) == 1 else 's'}"
+        say(f"{count}, marked in {manifest}: {listed}", err=True)
     say(f"page: {result.page}")
     print_verdict(verdict, result.session, manifest)
 

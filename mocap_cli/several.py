@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from mocap_cli.options import any_place, is_url
-from mocap_cli.terminal import one_line, print_json, say
+from mocap_cli.terminal import next_once, one_line, print_json, say
 from pipelines.session.errors import DataError, MocapError
 
 Command = Callable[..., dict[str, Any] | None]
@@ -128,13 +128,14 @@ def _run_all(
 ) -> None:
     results: dict[str, Any] = {}
     failed: dict[str, str] = {}
-    for path, call in zip(paths, calls, strict=True):
-        if titled:
-            say(f"{one_line(str(path))}:")
-        try:
-            results[str(path)] = call()
-        except MocapError as error:
-            failed[str(path)] = tell(error)
+    with next_once():
+        for path, call in zip(paths, calls, strict=True):
+            if titled:
+                say(f"{one_line(str(path))}:")
+            try:
+                results[str(path)] = call()
+            except MocapError as error:
+                failed[str(path)] = tell(error)
     if as_json:
         print_json({"results": results, "failed": failed})
     end(failed, paths)

@@ -135,8 +135,27 @@ def _noting_compilation(notes: _Notes) -> Iterator[None]:
 
 def say_next(command: str, place: Path, quiet: bool) -> None:
     """Print the next command of the user's way, as the last line; `{}` in it stands for a path."""
-    if not quiet:
+    if quiet:
+        return
+    held = click.get_current_context().meta.get(_HELD)
+    if held is None:
         say(f"next: {command.format(shlex.quote(str(place)))}")
+    else:
+        held.setdefault(command, []).append(shlex.quote(str(place)))
+
+
+_HELD = "mocap.next"
+
+
+@contextmanager
+def next_once() -> Iterator[None]:
+    """Hold back next commands; at the end print the one that most of them are, with all their paths."""
+    held: dict[str, list[str]] = {}
+    click.get_current_context().meta[_HELD] = held
+    yield
+    if held:
+        command, places = max(held.items(), key=lambda item: len(item[1]))
+        say(f"next: {command.format(' '.join(places))}")
 
 
 def say_warnings(warnings: Sequence[str], quiet: bool) -> None:

@@ -4,8 +4,9 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import sha256
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from pipelines.drafting.found import (
     label_of,
     label_of_place,
 )
-from pipelines.drafting.manifest_text import write_manifest
+from pipelines.drafting.manifest_text import flow, one_line, write_manifest
 from pipelines.drafting.matching import Ask, MotionMatch, match
 from pipelines.drafting.motion import TrackedPoints, explain_motion, explains_better
 from pipelines.formats.common.rows import median_step_ns
@@ -46,7 +47,7 @@ from pipelines.formats.logs.trajectories import attitudes_of, poses_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
 from pipelines.formats.videos.picture_folder import FolderPictures, picture_files, read_tags
 from pipelines.formats.videos.video import VideoReader, created_ns
-from pipelines.geometry.arrays import Float, Int64, Place, RelativeTo
+from pipelines.geometry.arrays import Float, Int64, Intrinsics, Place, RelativeTo
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera, level_heading
 from pipelines.geometry.poses import interpolate_points, interpolate_poses, multiply
@@ -56,7 +57,7 @@ from pipelines.session.manifest import read_flight
 from pipelines.session.maps import MapSizeError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import EXPECTED, describe_unknown, recognise, refuse_pointers
-from pipelines.session.records import SHARED_SECONDS, UNTIMED, PoseSample
+from pipelines.session.records import SHARED_SECONDS, UNTIMED, PoseSample, Trajectory
 from pipelines.session.registries import (
     FORMATS,
     CalibrationFormat,
@@ -72,6 +73,10 @@ from pipelines.session.registries import (
     VideoFormat,
 )
 from pipelines.session.storage import as_data_error, drop_link
+from pipelines.sources.attitudes import FilmOfCamera, turned_by_pictures
+from pipelines.sources.parts import CameraFrames
+from pipelines.sources.pictures import open_files
+from pipelines.sources.poses import USUAL_SATELLITE_SIGMA_M
 
 # Coordinates beyond it are those of a map projection, m.
 MAX_LOCAL_M = 100_000.0
@@ -90,6 +95,9 @@ MIN_POINTS_OF_A_STRETCH = 12
 
 # A picture is 1.25 focal lengths wide at an ordinary angle of view, 64 deg.
 NOMINAL_FOCAL = 0.8
+
+# Focal lengths are compared as on photographic film.
+WIDTH_OF_FILM_MM = 36.0
 
 # Tilts that are tried for a camera whose mount nobody stated, deg.
 TRIED_DOWN_DEG = (0.0, 30.0, 60.0, 90.0)
@@ -171,7 +179,7 @@ def draft(
 
     candidates = [each for each in found if isinstance(each, Proposal)]
     logs = [each for each in found if isinstance(each, FoundLog)]
-    flight = match(candidates, logs, _MotionComparison(), _distance_m, ask)
+    flight = match(candidates, logs, _MotionComparison(), _focal_by_film, _distance_m, ask)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
     text = manifest.text
     if [_absolute(target.parent)] == [_absolute(path) for path in paths]:
@@ -210,6 +218,23 @@ def must_be_drafted(manifest: Path) -> bool:
     if not mark or edited != _digest(text):
         return False
     return "missing: " in text or files.strip() != _digest(_listing(manifest))
+
+
+def leave_out(manifest: Path, reason: str) -> bool:
+    """Turn the camera that a reason names into comments, in a draft that nobody edited with more cameras."""
+    text, mark, digests = manifest.read_text(encoding="utf-8").rpartition(_DRAFT)
+    edited, _, files = digests.partition(" of ")
+    cameras = read_flight(manifest).cameras
+    named = [name for name in cameras if f": cameras.{name}." in reason]
+    if not mark or edited != _digest(text) or len(named) != 1 or len(cameras) == 1:
+        return False
+    before, head, after = text.partition(f"\n  {flow(named[0])}:\n")
+    lines = list(takewhile(lambda line: line.startswith("    "), after.splitlines()))
+    kept = "\n".join(f"  # {line.strip()}" for line in [head.strip(), *lines])
+    rest = "\n".join(after.splitlines()[len(lines) :])
+    text = f"{before}\n  # left out: {one_line(reason)}\n{kept}\n{rest}\n"
+    problem = _write(manifest, f"{text}{_DRAFT}{_digest(text)} of {files.strip()}\n")
+    return not problem
 
 
 def _digest(text: str) -> str:
@@ -619,6 +644,56 @@ def _followed_points(path: Path) -> TrackedPoints:
         np.concatenate([nothing, *begins]),
         np.concatenate([nothing, *ends]),
     )
+
+
+def _focal_by_film(film: FoundFilm, found: Proposal, start_ns: int) -> float | None:
+    """Measure a focal length (mm on film 36 mm wide) by a map of the pictures that lies on logged places."""
+    places = _places_in(found)
+    if places is None:
+        return None
+    index = recognise(film.path, VideoFormat, "video").index(film.path)
+    if index.codec == UNTIMED or len(index.pts_ns) < 2:
+        return None
+    pts_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
+    frames = CameraFrames(np.arange(len(pts_ns)), start_ns + pts_ns - pts_ns[0], pts_ns)
+    focal_px = NOMINAL_FOCAL * film.size[0]
+    with suppress(DataError):
+        turned = turned_by_pictures(
+            str(film.path),
+            film.path.name,
+            FilmOfCamera("", partial(open_files, [film.path], None, "header")),
+            frames,
+            Intrinsics(
+                fx=focal_px,
+                fy=focal_px,
+                cx=(film.size[0] - 1) / 2,
+                cy=(film.size[1] - 1) / 2,
+                width=film.size[0],
+                height=film.size[1],
+            ),
+            Trajectory(*places, np.tile([0.0, 0.0, 0.0, 1.0], (len(places[0]), 1))),
+            refine_focal=True,
+            pose_noise=None,
+            satellite_sigma_m=USUAL_SATELLITE_SIGMA_M if found.by_gps else None,
+            kept=lambda _: None,
+            note=lambda _: None,
+            progress=Silent(),
+        )
+        if turned.map.focal_ratio != 1.0:
+            return NOMINAL_FOCAL * turned.map.focal_ratio * WIDTH_OF_FILM_MM
+    return None
+
+
+def _places_in(found: Proposal) -> tuple[Int64, Float] | None:
+    """Read times and positions, m."""
+    if not isinstance(found, FlownPoses):
+        poses = _poses_in(found)
+        return poses if poses is None else poses[:2]
+    if found.telemetry is None:
+        return None
+    track = found.telemetry.position
+    position = _enu(track.values, Place(*track.values[0].tolist())) if track.on_earth else track.values
+    return track.t_ns, position
 
 
 def _poses_in(found: Proposal) -> tuple[Int64, Float, Float] | None:

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.draft import draft, must_be_drafted
+from pipelines.draft import draft, leave_out, must_be_drafted
 from pipelines.drafting.manifest_text import one_line
 from pipelines.drafting.matching import Answer, Ask, Question
-from pipelines.ingest import ingest
+from pipelines.ingest import Ingested, ingest
 from pipelines.reconstruct import Reconstructed, reconstruct
 from pipelines.replan import replan
 from pipelines.report import report
@@ -40,7 +40,7 @@ def run(
     """
     progress = progress or Silent()
     manifest, assumed = drafted(folder, ask=ask, progress=progress)
-    ingested = ingest(manifest, progress=progress)
+    ingested, left_out = _ingested(manifest, progress)
     session, description = ingested.folder, ingested.description
     reconstructed = reconstruct(session, workers=workers, progress=progress)
     if description.map is not None and description.actor is not None:
@@ -49,11 +49,23 @@ def run(
         except DataError as error:
             progress.note(f"planners were not compared: {error}")
     page = report(session).place
-    said = [*description.warnings, *reconstructed.record.warnings]
+    said = [*left_out, *description.warnings, *reconstructed.record.warnings]
     warnings = [
         each for each in dict.fromkeys(said) if each not in assumptions_as_warnings(description.assumptions)
     ]
     return Ran(manifest, assumed or description.assumptions, session, reconstructed, page, warnings)
+
+
+def _ingested(manifest: Path, progress: Progress) -> tuple[Ingested, list[str]]:
+    """Ingest a flight without cameras of a draft whose films do not say how they turned; say which."""
+    left_out: list[str] = []
+    while True:
+        try:
+            return ingest(manifest, progress=progress), left_out
+        except DataError as error:
+            if error.code != "no-attitude" or not leave_out(manifest, str(error)):
+                raise
+            left_out.append(f"left out: {error}")
 
 
 def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[str]]:

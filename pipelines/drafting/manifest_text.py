@@ -17,16 +17,15 @@ from ruamel.yaml import YAML
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from pipelines.drafting.found import (
-    NO_DATE_NS,
     FlownPoses,
     FoundFilm,
     FoundFrames,
     FoundLog,
     Proposal,
     TimeSpan,
-    VideoStart,
+    camera_names,
 )
-from pipelines.drafting.matching import CameraDraft, Chosen, FlightDraft
+from pipelines.drafting.matching import CameraDraft, Chosen, FlightDraft, known_start
 from pipelines.session.manifest import PICTURES, SCHEMA, CameraSources, Manifest
 from pipelines.session.yaml_models import YamlModel
 
@@ -218,7 +217,7 @@ class _ManifestWriter:
             remark = self.miss(camera, "frame_times", "the times of its pictures, which EXIF does not have")
             times = DraftedKey(None, [remark], example={"start": "SECONDS", "fps": ASSUMED_FPS})
             return {"frame_times": times, "clock": clock}
-        if (known := _known_start(camera)) is not None:
+        if (known := known_start(camera)) is not None:
             settings: dict[str, object] = {"start": (Decimal(known.start_ns) / 10**9).normalize()}
             if not known.sigma_s:
                 return {"frame_times": DraftedKey(settings, [known.source]), "clock": clock}
@@ -258,7 +257,9 @@ class _ManifestWriter:
     def _pose(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("pose")
         if choice is None:
-            free = "nothing of that name has poses" if self.draft.free_poses else "no other file has poses"
+            free = "no other file has poses"
+            if self.draft.free_poses:
+                free = "neither names nor times nor the motion in its pictures tell which of the poses below"
             remark = self.miss(camera, "pose", free)
             others = self.others("pose", self.draft.free_poses)
             return DraftedKey(None, [remark], others, example={"file": f"{camera.name}.tum"})
@@ -346,8 +347,9 @@ class _ManifestWriter:
     def _intrinsics(self, camera: CameraDraft) -> DraftedKey:
         choice = camera.choices.get("intrinsics")
         if choice is None and (guess := _lens(camera)) is not None:
-            what = f"a focal length of {camera.focal_35_mm:g} mm on film 36 mm wide, no calibration"
-            remark = self.assume(camera, "intrinsics", what)
+            how = "by its pictures, to some 5 %" if camera.focal_by_film else "a guess without a calibration"
+            what = f"a focal length of {camera.focal_35_mm:.3g} mm on film 36 mm wide, {how}"
+            remark = what if camera.focal_by_film else self.assume(camera, "intrinsics", what)
             return DraftedKey(guess, [remark], self.others("intrinsics", self.draft.free_intrinsics))
         if choice is None:
             free = "nothing of that name has them" if self.draft.free_intrinsics else "no other file has them"
@@ -398,14 +400,26 @@ class _ManifestWriter:
             entries[name] = DraftedKey(settings, remarks)
         return entries
 
-    def actor(self) -> DraftedKey:
-        """Return the source of the person's logged positions."""
+    def actors(self) -> dict[str, DraftedKey]:
+        """Return the sources of logged positions: of one person, or of several with other names."""
         if not self.draft.actors:
-            return DraftedKey()
-        taken = self.draft.actors[0]
+            return {}
+        drones = [c.label for c in self.draft.cameras]
+        drones += [c.choices["pose"].taken.labels[0] for c in self.draft.cameras if "pose" in c.choices]
+        of_drones = {word.key for label in drones for word in label}
+        people: dict[tuple[object, ...], Proposal] = {}
+        for candidate in self.draft.actors:
+            own = tuple(word.key for word in candidate.labels[0] if word.key not in of_drones)
+            people.setdefault(own, candidate)
         remark = self.assume(None, "actor", "point hip, which the log follows; or head, feet, centre")
-        entry = self.entry("actor", self.draft.actors, [remark], {**taken.settings, "point": "hip"})
-        return replace(entry, blank=True)
+        taken = list(people.values())
+        if len(taken) == 1:
+            settings = {**taken[0].settings, "point": "hip"}
+            entry = self.entry("actor", self.draft.actors, [remark], settings)
+            return {"actor": replace(entry, blank=True)}
+        names = camera_names([each.labels[0] for each in taken])
+        stated = [self.guessed({**each.settings, "point": "hip"}) for each in taken]
+        return {"actors": DraftedKey(dict(zip(names, stated, strict=True)), [remark], blank=True)}
 
     def map(self) -> DraftedKey:
         """Return the map: the first file, else a topic that lies where the poses do."""
@@ -481,40 +495,13 @@ def _lens(camera: CameraDraft) -> dict[str, object] | None:
     width, height = film.size
     focal_px = round(focal_35_mm / 36 * max(film.size), 1)
     size: dict[str, object] = {"width": width, "height": height, "fx": focal_px, "fy": focal_px}
-    return {**size, "cx": (width - 1) / 2, "cy": (height - 1) / 2, "assumed": True}
+    guessed = {} if camera.focal_by_film else {"assumed": True}
+    return {**size, "cx": (width - 1) / 2, "cy": (height - 1) / 2, **guessed}
 
 
 def _settings(candidate: Proposal) -> dict[str, object]:
     logged = candidate.kind == "pose" and ("topic" in candidate.settings or "parent" in candidate.settings)
     return {**candidate.settings, **({"of": "body" if candidate.of_body else "camera"} if logged else {})}
-
-
-def _known_start(camera: CameraDraft) -> VideoStart | None:
-    """Return a video's start by the log of its poses, or by its own metadata if the log covers it then."""
-    film, choice = camera.film, camera.choices.get("pose")
-    if film is None or choice is None:
-        return None
-    taken = choice.taken
-    if choice.start_ns is not None:
-        return VideoStart(choice.start_ns, "when its pictures move as its poses", sigma_s=0.2)
-    for candidate in (taken, *choice.others):  # poses of another log, the clock of its own
-        start = candidate.video_start if isinstance(candidate, FlownPoses) else None
-        if start and candidate.path == film.path and (candidate is taken or start.start_ns > NO_DATE_NS):
-            return start
-    if isinstance(taken, FlownPoses):
-        if taken.video_start is not None and taken.path.suffix.lower() == ".srt":
-            return taken.video_start
-        if (recorded := taken.film_of(film)) is not None:
-            source = "when the flight record says that a video began"
-            return VideoStart(recorded.first_ns, source, sigma_s=1)
-    if film.made_ns is None or taken.span is None:
-        return None
-    if film.path.is_dir() and taken.path == film.path:
-        whole = film.clock == "whole seconds"
-        return VideoStart(film.made_ns, "by the EXIF of its pictures", sigma_s=1 if whole else 0)
-    if taken.span.overlap_ns(TimeSpan(film.made_ns, film.made_ns + film.length_ns)) < film.length_ns:
-        return None
-    return VideoStart(film.made_ns, "by the time of creation in its metadata", sigma_s=1)
 
 
 def _first_frame(listed: FoundFrames, film: FoundFilm | None) -> int:
@@ -540,7 +527,7 @@ def write_manifest(draft: FlightDraft, name: str, relative: Callable[[Path], str
         lines.append(f"  {flow(camera.name)}:")
         for key, entry in writer.camera(camera).items():
             lines += [f"    {line}" for line in entry.lines(key, CameraSources)]
-    for key, entry in (("actor", writer.actor()), ("map", writer.map()), ("truth", writer.truth())):
+    for key, entry in {**writer.actors(), "map": writer.map(), "truth": writer.truth()}.items():
         lines += entry.lines(key, Manifest)
     lines += writer.unused()
     return ManifestText("\n".join(lines) + "\n", _in_short(writer.missing), _in_short(writer.assumed))

@@ -31,6 +31,7 @@ from pipelines.drafting.found import (
     Label,
     Proposal,
     TimeSpan,
+    VideoStart,
     affinity,
     camera_names,
     choose_stamps,
@@ -48,6 +49,9 @@ SAME_DRONE_M = 30.0
 
 # Subtitles may lack this share of the frames of their own video.
 MAX_MISSING_SUBTITLES = 0.1
+
+# Focal lengths of one lens, measured by several films, differ by less.
+SAME_LENS_SHARE = 0.1
 
 LENSES_35_MM = {
     24: "drones since 2018",
@@ -75,6 +79,8 @@ class MotionMatch:
 
 Compare = Callable[[FoundFilm, Proposal, Sequence[Proposal]], MotionMatch | None]
 """Comparison of a video with poses, and with angles of gimbals; None if one of them shows no motion."""
+FocalByFilm = Callable[[FoundFilm, Proposal, int], float | None]
+"""Focal length (as on film 36 mm wide) that a video shows with poses and its start; None if it shows none."""
 Distance = Callable[[FlownPoses, FlownPoses], float | None]
 """Median distance across (m) of the positions in two drones' logs; None if they share no time or place."""
 
@@ -109,6 +115,11 @@ class Chosen:
     why: str = ""
     start_ns: int | None = None  # of the video, if that was found with it
 
+    @property
+    def all(self) -> tuple[Proposal, ...]:
+        """It and its alternatives."""
+        return (self.taken, *self.others)
+
 
 @dataclass(eq=False)
 class CameraDraft:
@@ -121,7 +132,9 @@ class CameraDraft:
     choices: dict[str, Chosen] = field(default_factory=dict)
     gimbal_reference: RelativeTo | None = None  # what its gimbal's angles are relative to
     motion: MotionMatch | None = None  # of its video and poses, where they agree
+    likely: dict[int, float] = field(default_factory=dict)  # gain of motion by id of poses
     focal_35_mm: float | None = None  # as on film 36 mm wide, where no calibration has it
+    focal_by_film: bool = False  # its pictures determine it
     true_poses: Chosen | None = None
 
     @property
@@ -140,7 +153,7 @@ class CameraDraft:
         """List every candidate that the manifest mentions for it, also those in comments."""
         choices = [*self.choices.values(), *([self.true_poses] if self.true_poses else [])]
         listed = [*self.pictures["video"], *self.pictures["keypoints"]]
-        return listed + [c for choice in choices for c in (choice.taken, *choice.others)]
+        return listed + [c for choice in choices for c in choice.all]
 
 
 @dataclass(frozen=True)
@@ -158,12 +171,17 @@ class FlightDraft:
 
 
 def match(
-    found: Sequence[Proposal], recordings: Sequence[FoundLog], compare: Compare, distance: Distance, ask: Ask
+    found: Sequence[Proposal],
+    recordings: Sequence[FoundLog],
+    compare: Compare,
+    focal_by_film: FocalByFilm,
+    distance: Distance,
+    ask: Ask,
 ) -> FlightDraft:
     """Find the cameras, and what belongs to each.
 
     `compare` decides where neither names nor times do, `distance` between logs of one time, for cameras whose
-    own positions lack attitudes, and `ask` what nothing else does.
+    own positions lack attitudes, `focal_by_film` what no calibration tells, and `ask` what nothing else does.
     """
     logs = choose_stamps(join_parts(recordings))
     every = [*found, *(candidate for log in logs for candidate in log.candidates())]
@@ -187,7 +205,9 @@ def match(
         pose = chosen or choose(true)
         if chosen is not None:
             camera.true_poses = choose([c for c in true if not c.topic])
-        turned = choose(gimbals) if pose and (pose.taken.of_body or pose.taken.unturned) else None
+        turned = None
+        if pose and (pose.taken.of_body or pose.taken.unturned):
+            turned = choose(gimbals) or _beside_pose(pose.taken, gimbals, moving)
         found_choices = {
             "pose": pose,
             "intrinsics": choose(of.get("intrinsics", []), shared=True),
@@ -195,12 +215,19 @@ def match(
             "gimbal": turned,
         }
         camera.choices = {part: choice for part, choice in found_choices.items() if choice is not None}
-    _pair_by_content(cameras, moving, gimbals, of.get("intrinsics", []), compare)
+    _pair_by_content(cameras, moving, gimbals, compare)
     _prefer_attitudes(cameras, moving, distance)
+    for camera in cameras:
+        logged = camera.choices.get("pose")
+        if logged is not None and "intrinsics" not in camera.choices:
+            beside = _beside_pose(logged.taken, of.get("intrinsics", []), moving)
+            camera.choices |= {"intrinsics": beside} if beside else {}
     _pair_the_last_lens(cameras, of.get("intrinsics", []))
     for camera in cameras:
-        _ask_for_the_rest(camera, cameras, moving, of.get("intrinsics", []), ask)
-    _find_lenses([c for c in cameras if c.film is not None and "intrinsics" not in c.choices], of, ask)
+        _ask_for_the_rest(camera, cameras, moving, gimbals, of.get("intrinsics", []), compare, ask)
+    _find_lenses(
+        [c for c in cameras if c.film is not None and "intrinsics" not in c.choices], of, focal_by_film, ask
+    )
     if any("pose" in c.choices and c.choices["pose"].taken.by_gps for c in cameras):
         actors += [c for c in of.get("fixes", []) if is_called(f"{c.topic} {c.place[-1]}", ACTOR)]
     maps = _maps(of.get("map", []), cameras)
@@ -342,7 +369,6 @@ def _pair_by_content(
     cameras: Sequence[CameraDraft],
     moving: Sequence[Proposal],
     gimbals: Sequence[Proposal],
-    intrinsics: Sequence[Proposal],
     compare: Compare,
 ) -> None:
     """Give videos without poses those that no camera has, by time, else by motion.
@@ -363,9 +389,14 @@ def _pair_by_content(
         logs = possible[camera.name]
         if len(logs) == 1 and uses[id(logs[0])] == 1:
             camera.choices["pose"] = Chosen(logs[0], named=False, why="by the times of video and log")
-            if turning := _beside_pose(logs[0], gimbals):
-                camera.choices["gimbal"] = Chosen(turning[0], tuple(turning[1:]))
-        elif (own := _own_by_motion(film, logs, gimbals, compare)) is not None:
+            if turning := _beside_pose(logs[0], gimbals, moving):
+                camera.choices["gimbal"] = turning
+            continue
+        turned = [(log, _beside_pose(log, gimbals, moving)) for log in logs]
+        compared = [(log, compare(film, log, beside.all if beside else ())) for log, beside in turned]
+        known = [(log, alike) for log, alike in compared if alike is not None]
+        camera.likely = {id(log): float(np.nansum(alike.gain)) for log, alike in known}
+        if (own := _own_by_motion(known)) is not None:
             found[camera.name] = own
     for camera, _ in filmed:
         motion = found.get(camera.name)
@@ -376,10 +407,6 @@ def _pair_by_content(
             if alike.gimbal is not None:
                 camera.choices["gimbal"] = Chosen(alike.gimbal)
                 camera.gimbal_reference = alike.relative_to
-    for camera, _ in filmed:
-        pose, lenses = camera.choices.get("pose"), camera.choices.get("intrinsics")
-        if pose is not None and lenses is None and (beside := _beside_pose(pose.taken, intrinsics)):
-            camera.choices["intrinsics"] = Chosen(beside[0], tuple(beside[1:]))
     for camera in cameras:
         _settle_by_motion(camera, compare)
 
@@ -407,14 +434,21 @@ def _ask_for_the_rest(
     camera: CameraDraft,
     cameras: Sequence[CameraDraft],
     moving: Sequence[Proposal],
+    gimbals: Sequence[Proposal],
     intrinsics: Sequence[Proposal],
+    compare: Compare,
     ask: Ask,
 ) -> None:
-    """Ask for poses, intrinsics and the reference of a gimbal that neither names nor contents tell."""
+    """Ask for poses, intrinsics and the reference of a gimbal that neither names nor contents tell.
+
+    What explains the motion in its pictures best is the likeliest.
+    """
     film, taken = camera.film, [c.choices["pose"].taken for c in cameras if "pose" in c.choices]
     free = [c for c in moving if c not in taken and (film is None or _may_be_of(film, c))]
     for key, candidates in (("pose", free), ("intrinsics", intrinsics)):
-        listed = sorted(candidates, key=lambda each: (each.rank, each.place))
+        listed = sorted(
+            candidates, key=lambda each: (-camera.likely.get(id(each), 0.0), each.rank, each.place)
+        )
         if key in camera.choices or not listed:
             continue
         options = tuple(f"{' '.join(filter(None, (c.path.name, c.topic)))} ({c.about})" for c in listed)
@@ -422,6 +456,10 @@ def _ask_for_the_rest(
             others = tuple(c for k, c in enumerate(listed) if k != answer.option)
             why = "for nothing else is as likely"
             camera.choices[key] = Chosen(listed[answer.option], others, answer.stated, why)
+            if key == "pose":
+                if turning := _beside_pose(listed[answer.option], gimbals, moving):
+                    camera.choices["gimbal"] = turning
+                _settle_by_motion(camera, compare)
     if "gimbal" in camera.choices and camera.gimbal_reference is None:
         references: tuple[RelativeTo, ...] = get_args(RelativeTo)
         options = tuple(f"angles relative to the {each}" for each in references)
@@ -429,8 +467,13 @@ def _ask_for_the_rest(
             camera.gimbal_reference = references[answer.option]
 
 
-def _find_lenses(cameras: Sequence[CameraDraft], of: Mapping[str, Sequence[Proposal]], ask: Ask) -> None:
-    """Find focal lengths without a calibration: by subtitles or EXIF, else one for all by asking."""
+def _find_lenses(
+    cameras: Sequence[CameraDraft],
+    of: Mapping[str, Sequence[Proposal]],
+    focal_by_film: FocalByFilm,
+    ask: Ask,
+) -> None:
+    """Find focal lengths without a calibration: by pictures, else by subtitles or EXIF, else by asking."""
     flown = [c for c in of.get("pose", []) if isinstance(c, FlownPoses) and c.focal_35_mm]
     stated = {c.labels: c.focal_35_mm for c in flown}
     for camera in cameras:
@@ -439,6 +482,7 @@ def _find_lenses(cameras: Sequence[CameraDraft], of: Mapping[str, Sequence[Propo
             camera.focal_35_mm = stated.get(camera.film.labels, camera.film.focal_35_mm)
         if isinstance(pose, FlownPoses) and pose.focal_35_mm:
             camera.focal_35_mm = pose.focal_35_mm
+    _measure_lenses(cameras, focal_by_film)
     unknown = [camera for camera in cameras if camera.focal_35_mm is None]
     if not unknown or of.get("intrinsics"):
         return
@@ -448,16 +492,68 @@ def _find_lenses(cameras: Sequence[CameraDraft], of: Mapping[str, Sequence[Propo
             camera.focal_35_mm = list(LENSES_35_MM)[answer.option]
 
 
-def _beside_pose(pose: Proposal, candidates: Sequence[Proposal]) -> list[Proposal]:
-    """List what a log has of the same name as a topic of poses in it."""
+def _measure_lenses(cameras: Sequence[CameraDraft], focal_by_film: FocalByFilm) -> None:
+    """Measure focal lengths by films with poses. Films of one size are of one kind of camera."""
+    measured: dict[str, float] = {}
+    for camera in cameras:
+        pose, film, start = camera.choices.get("pose"), camera.film, known_start(camera)
+        start_ns = start.start_ns if start else None
+        times = camera.choices.get("frame_times")
+        if pose and times and times.taken.path == pose.taken.path and pose.taken.span:  # subtitles have both
+            start_ns = pose.taken.span.first_ns
+        if pose is not None and film is not None and start_ns is not None:
+            focal_35_mm = focal_by_film(film, pose.taken, start_ns)
+            measured |= {} if focal_35_mm is None else {camera.name: focal_35_mm}
+    for camera in cameras:
+        size = camera.film.size if camera.film else None
+        alike = [measured[c.name] for c in cameras if c.name in measured and c.film and c.film.size == size]
+        if alike:
+            usual = float(np.median(alike))
+            own = measured.get(camera.name, usual)
+            camera.focal_35_mm = usual if abs(own - usual) < SAME_LENS_SHARE * usual else own
+            camera.focal_by_film = True
+
+
+def known_start(camera: CameraDraft) -> VideoStart | None:
+    """Return a video's start by the log of its poses, or by its own metadata if the log covers it then."""
+    film, choice = camera.film, camera.choices.get("pose")
+    if film is None or choice is None:
+        return None
+    taken = choice.taken
+    if choice.start_ns is not None:
+        return VideoStart(choice.start_ns, "when its pictures move as its poses", sigma_s=0.2)
+    for candidate in (taken, *choice.others):  # poses of another log, the clock of its own
+        start = candidate.video_start if isinstance(candidate, FlownPoses) else None
+        if start and candidate.path == film.path and (candidate is taken or start.start_ns > NO_DATE_NS):
+            return start
+    if isinstance(taken, FlownPoses):
+        if taken.video_start is not None and taken.path.suffix.lower() == ".srt":
+            return taken.video_start
+        if (recorded := taken.film_of(film)) is not None:
+            source = "when the flight record says that a video began"
+            return VideoStart(recorded.first_ns, source, sigma_s=1)
+    if film.made_ns is None or taken.span is None:
+        return None
+    if film.path.is_dir() and taken.path == film.path:
+        whole = film.clock == "whole seconds"
+        return VideoStart(film.made_ns, "by the EXIF of its pictures", sigma_s=1 if whole else 0)
+    if taken.span.overlap_ns(TimeSpan(film.made_ns, film.made_ns + film.length_ns)) < film.length_ns:
+        return None
+    return VideoStart(film.made_ns, "by the time of creation in its metadata", sigma_s=1)
+
+
+def _beside_pose(pose: Proposal, candidates: Sequence[Proposal], moving: Sequence[Proposal]) -> Chosen | None:
+    """Choose what a log has of the name of a topic of poses in it; of any name where one drone logged."""
     alike = [(_likeness(c, pose.labels[0]), c) for c in candidates if c.topic and c.path == pose.path]
     own = [(likeness, c) for likeness, c in alike if likeness >= NUMBER]
-    return [c for _, c in sorted(own, key=lambda each: (-each[0], each[1].rank))]
+    drones = {tuple(word.key for word in c.labels[0]) for c in moving if c.path == pose.path}
+    ranked = sorted(own or (alike if len(drones) == 1 else ()), key=lambda each: (-each[0], each[1].rank))
+    return Chosen(ranked[0][1], tuple(c for _, c in ranked[1:])) if ranked else None
 
 
 def _taken(cameras: Sequence[CameraDraft]) -> list[Proposal]:
     chosen = [choice for camera in cameras if (choice := camera.choices.get("pose"))]
-    return [c for choice in chosen for c in (choice.taken, *choice.others)]
+    return [c for choice in chosen for c in choice.all]
 
 
 def _prefer_attitudes(cameras: Sequence[CameraDraft], moving: Sequence[Proposal], distance: Distance) -> None:
@@ -520,12 +616,8 @@ def _share_time(log: Proposal, other: Proposal) -> bool:
     return 2 * log.span.overlap_ns(other.span) >= other.span.length_ns
 
 
-def _own_by_motion(
-    film: FoundFilm, logs: Sequence[Proposal], gimbals: Sequence[Proposal], compare: Compare
-) -> tuple[Proposal, MotionMatch] | None:
+def _own_by_motion(known: Sequence[tuple[Proposal, MotionMatch]]) -> tuple[Proposal, MotionMatch] | None:
     """Return the log that explains a video's motion clearly, and clearly better than all others."""
-    compared = ((log, compare(film, log, _beside_pose(log, gimbals))) for log in logs)
-    known = [(log, alike) for log, alike in compared if alike is not None]
     for log, alike in known:
         others = [other.gain for each, other in known if each is not log]
         if all(explains_better(alike.gain, other) for other in (np.zeros_like(alike.gain), *others)):

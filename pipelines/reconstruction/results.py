@@ -419,12 +419,13 @@ def _figures_of_trial(metrics: Mapping[str, Any]) -> dict[str, float | None]:
 # --- tables --------------------------------------------------------------------------------------------
 
 
-def write_figures(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
+def write_figures(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[str]) -> dict[str, Any]:
     """Write metrics.json, and what it would say of each joint and bone as tables beside it.
 
     Args:
         folder: the folder of the stage, with skeleton.parquet.
         figures: those of `assess` and more, JSON-able.
+        guessed_lenses: cameras whose focal length is a guess.
 
     Returns:
         The content of metrics.json.
@@ -439,7 +440,7 @@ def write_figures(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
     stored = {name: value for name, value in figures.items() if name != "per_joint"}
     stored["intervals"] = {name: value for name, value in intervals_of.items() if name != "per_joint"}
     stored["shape"] = {name: value for name, value in shape.items() if name != "bones"}
-    stored["verdict"] = verdict(folder, stored)
+    stored["verdict"] = verdict(folder, stored, guessed_lenses)
     write_json(folder / "metrics.json", stored)
     return stored
 
@@ -649,6 +650,8 @@ ERROR_OVER_PREDICTED = {
 }
 # Three cameras and more agree better than their covariances say: each errs by itself, by what it can err.
 OF_MORE_THAN_TWO = 0.8
+# A guessed focal length is off by 15 %, and joints are 0.45 m from the middle of a body.
+GUESSED_LENS_MM = 0.15 * 450.0
 # Expected errors below are good: as of optical systems without markers that stand still.
 GOOD_MM = 60.0
 # Beyond, steps and joint angles are no longer usable.
@@ -659,12 +662,13 @@ LEAST_SHARE = 0.5
 USUAL_SHARE = 0.9
 
 
-def verdict(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
+def verdict(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[str]) -> dict[str, Any]:
     """Judge a reconstruction without truth.
 
     Args:
         folder: of the stage, with skeleton.parquet.
         figures: those of metrics.json.
+        guessed_lenses: cameras whose focal length is a guess.
 
     Returns:
         `grade`: `good`, `usable`, `poor`, or `wrong` where the flight is doubted; `expected_error_mm`: the
@@ -680,9 +684,15 @@ def verdict(folder: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
     factors = ERROR_OVER_PREDICTED.get(kind, ERROR_OVER_PREDICTED["estimated"])
     cameras = len(figures["reprojection_px_per_camera"])
     predicted_mm *= OF_MORE_THAN_TWO if cameras > 2 else 1.0
+    predicted_mm = float(np.hypot(predicted_mm, GUESSED_LENS_MM if guessed_lenses else 0.0))
     expected = [round(predicted_mm * factor, 1) for factor in factors] if np.isfinite(predicted_mm) else None
     doubts, share = figures.get("doubts") or [], figures["reconstructed_share"]
     why = [str(doubt["what"]) for doubt in doubts]
+    if guessed_lenses:
+        named = ", ".join(guessed_lenses)
+        why.append(
+            f"the focal length of {named} is a guess, and sizes are as wrong as it is: add a calibration"
+        )
     if share < USUAL_SHARE:
         why.append(f"{share:.0%} of the joints were measured")
     if not (used.get("background") or {}).get("cameras"):

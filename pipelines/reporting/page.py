@@ -175,7 +175,7 @@ def _key_figures(summary: Summary) -> list[tuple[str, str, str]]:
         frames = sum(camera.entry.frames.count for camera in summary.cameras)
         return [(wording.whole(frames), "", "frames")]
     share, _, unit = wording.percent(summary.share).rpartition(wording.THIN)
-    figures = [(share, unit, "of joint-frames measured")]
+    figures = [(share, unit, "of the joints measured")]
     for key, label in (
         ("mpjpe_mm", "mean error against truth (MPJPE)"),
         ("root_mpjpe_mm", "relative to the hips"),

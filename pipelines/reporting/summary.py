@@ -524,7 +524,7 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
         return Verdict("wrong", _why_nothing(summary), why=worst, next=f"mocap info {session}", doubts=doubts)
     given = section(summary.metrics, "verdict")
     grade = text(given, "grade")
-    lead = f"{percent(summary.share)} of {plural(summary.total, 'joint-frame')} were measured."
+    lead = f"{percent(summary.share)} of the joints were measured."
     why = tuple(str(each) for each in items(given, "why"))[:MOST_REASONS] or worst
     following = text(given, "next").replace("SESSION", session)
     if not following or following.startswith("mocap report"):  # that is this page
@@ -533,7 +533,7 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
     error = ""
     if len(ends) == 3:
         low, median, high = ends
-        error = f"{fixed(median, 0)} mm (expected: {fixed(low, 0)} to {fixed(high, 0)})"
+        error = f"{fixed(median, 0)} mm, likely {fixed(low, 0)} to {quantity(high, 'mm', 0)}"
     if (measured := number(summary.metrics, "mpjpe_mm")) is not None:
         error += f"{'; ' if error else ''}{quantity(measured, 'mm', 0)} against truth"
     return Verdict(grade, lead, error, why, following, doubts)

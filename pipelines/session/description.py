@@ -350,6 +350,13 @@ class Description(Entry):
         return self.truth is not None and bool(self.truth.joints)
 
     @property
+    def guessed_lenses(self) -> list[str]:
+        """The cameras whose focal length is a guess that no calibration and no film confirmed."""
+        maps = {name: entry.picture_map for name, entry in self.cameras.items()}
+        guessed = [name for name in maps if f"cameras.{name}.intrinsics.fx" in self.assumptions]
+        return [name for name in guessed if (found := maps[name]) is None or found.focal_ratio == 1.0]
+
+    @property
     def recorded(self) -> dict[str, str]:
         """The hashes of recordings that were ingested: every camera's pictures, and the actor's log.
 

@@ -695,7 +695,7 @@ class Manifest(YamlModel):
 
 def _assumed_in(mapping: Mapping[str, Any], place: str) -> Iterator[str]:
     if mapping.get("assumed"):
-        yield place
+        yield f"{place}.fx" if mapping.get("fx") else place  # a lens without a calibration is a guess
     for key, value in mapping.items():
         if isinstance(value, dict):
             yield from _assumed_in(value, f"{place}.{key}" if place else key)
