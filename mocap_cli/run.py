@@ -39,7 +39,8 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
     questions = _Questions(asks, takes=yes)
     with watching(-1 if asks else shown.level) as progress:
         manifest, assumed = drafted(folder, ask=questions.choose, progress=progress)
-    for remark in assumed[: questions.left]:
+    unasked = [each for each in assumed if not any(f": {key}: " in each for key in questions.answered)]
+    for remark in unasked[: questions.left]:
         questions.confirm(manifest, remark)
     with watching(shown.level) as progress:
         result = run(manifest, workers=workers, progress=progress)
@@ -70,6 +71,7 @@ class _Questions:
 
     def __init__(self, asks: bool, *, takes: bool) -> None:
         self.left = MAX_QUESTIONS if asks else 0
+        self.answered: set[str] = set()  # keys that somebody chose
         self._takes = takes or asks
 
     def choose(self, question: Question) -> Answer | None:
@@ -84,6 +86,7 @@ class _Questions:
             say(f"  {number}: {one_line(option)}", err=True)
         numbers = click.IntRange(0, len(question.options))
         chosen = click.prompt("Which (0: none of these)?", default=1, type=numbers, err=True)
+        self.answered.add(question.key)
         return Answer(chosen - 1, stated=True) if chosen else None
 
     def confirm(self, manifest: Path, remark: str) -> None:

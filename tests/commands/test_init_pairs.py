@@ -187,3 +187,11 @@ def test_videos_that_show_no_motion_are_not_paired(tmp_path: Path) -> None:
         write_video(tmp_path / f"{name}.mp4", even_ticks(60))
         write_ulog(tmp_path / f"log_{drone[-1]}7.ulg", ulog_rows(drone_of_sample(drone)))
     assert not any("pose" in camera for camera in cameras_of(tmp_path).values())
+
+
+def test_a_film_on_its_logged_places_gives_the_focal_length(tmp_path: Path) -> None:
+    copied(SAMPLE / "drone1.mp4", tmp_path / "left.mp4", pictures=180)
+    shutil.copyfile(SAMPLE / "truth" / "drone1.tum", tmp_path / "left.tum")
+    lens = cameras_of(tmp_path)["left"]["intrinsics"]
+    assert lens["fx"] == pytest.approx(640 / np.tan(np.radians(40)), rel=0.05)
+    assert "assumed" not in lens
