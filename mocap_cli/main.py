@@ -90,6 +90,9 @@ _SHORT_OF_MEMORY = (
 
 # Below it, libraries in C++ end the process themselves, with words of their own.
 MIN_ADDRESS_SPACE_BYTES = 700 << 20
+# These commands load more of such libraries.
+LARGE_COMMANDS = {"run", "reconstruct", "replan-compare", "report", "batch"}
+MIN_ADDRESS_SPACE_OF_LARGE_BYTES = 2000 << 20
 
 
 def _refuse_little_memory() -> None:
@@ -98,15 +101,19 @@ def _refuse_little_memory() -> None:
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_BYTES:
+        is_large = sys.argv[1:2] and sys.argv[1] in LARGE_COMMANDS
+        least = MIN_ADDRESS_SPACE_OF_LARGE_BYTES if is_large else MIN_ADDRESS_SPACE_BYTES
+        if limit != resource.RLIM_INFINITY and limit < least:
             raise OUT_OF_MEMORY
 
 
 def _is_short_of_memory(error: BaseException) -> bool:
-    """Return True if an error says that there is no memory left."""
+    """Return True if an error, or the one that caused it, says that there is no memory left."""
     if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return True
-    return any(words in str(error) for words in _SHORT_OF_MEMORY)
+    if any(words in str(error) for words in _SHORT_OF_MEMORY):
+        return True
+    return error.__cause__ is not None and _is_short_of_memory(error.__cause__)
 
 
 def print_error(error: MocapError) -> None:

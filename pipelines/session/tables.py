@@ -167,6 +167,8 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
     except MemoryError:  # one of Arrow's own is also an ArrowException
         raise
     except (OSError, pa.ArrowException, IndexError) as error:
+        if any(words in str(error) for words in ("launch worker thread", "annot allocate memory")):
+            raise MemoryError(str(error)) from error
         raise DataError(path, "cannot be read as Parquet", _AGAIN, code="damaged") from error
 
 
