@@ -24,7 +24,7 @@ from pipelines.session.parallel import return_freed_arrays
 from pipelines.session.people import logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Session, StageRecord, WritableSession, copy_session, locked, open_session
-from pipelines.session.storage import write_whole
+from pipelines.session.storage import drop_link, write_whole
 
 LOOK_S = 8.0
 """Seconds in the middle of a flight that the detector looks at."""
@@ -90,6 +90,7 @@ def fix(manifest: Path, **options: Any) -> tuple[Checked, list[str]]:
     copy = manifest.with_name(f".{manifest.name}.tried")  # beside it, since paths are relative
     try:
         while checked.doubts and (changed := mended(text, checked.doubts[0].remedy)) is not None:
+            drop_link(copy)
             copy.write_text(changed, encoding="utf-8")
             after = check(copy, **options)
             left = {doubt.code for doubt in after.doubts}
