@@ -160,16 +160,19 @@ class PosePrior:
     slow: tuple[Process, Process]  # shift in the world and rotation
     estimated: bool = False  # the levels of white and slow errors are only the start of an estimate
     clock_s: float = 0.0  # of the offset of the pictures' clock, 0 for a known one
+    assumed: bool = False  # nobody stated the constant errors either
 
     @classmethod
     def of(cls, errors: PoseErrors | None) -> PosePrior:
         """Build the prior from stated pose errors; None for unknown ones.
 
-        Where only a large constant rotation is stated, white errors are open: no log is exact in itself.
+        Where only a large constant rotation is stated, the others are estimated: no log is exact in itself.
         """
+        unknown = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
         if errors is None:
-            slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
-            return cls(_UNKNOWN_WHITE, (*UNKNOWN_SIGMA, _UNKNOWN_ARM_M), slow, estimated=True)
+            return cls(
+                _UNKNOWN_WHITE, (*UNKNOWN_SIGMA, _UNKNOWN_ARM_M), unknown, estimated=True, assumed=True
+            )
         constant = dict.fromkeys((SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA), 0.0)
         changing: dict[int, list[Process]] = {SHIFT_IN_WORLD: [], ROTATION: []}
         for process in errors.processes:
@@ -179,8 +182,9 @@ class PosePrior:
                 changing[ROTATION if process.number == ROTATION else SHIFT_IN_WORLD].append(process)
         whole = (constant[SHIFT_IN_WORLD], constant[ROTATION], constant[SHIFT_IN_CAMERA])
         slow = (_sum(SHIFT_IN_WORLD, changing[SHIFT_IN_WORLD]), _sum(ROTATION, changing[ROTATION]))
-        left_out = not any(errors.white) and whole[1] > _FAR_RAD
-        return cls(_UNKNOWN_WHITE if left_out else errors.white, whole, slow)
+        if not any(errors.white) and whole[1] > _FAR_RAD:
+            return cls(_UNKNOWN_WHITE, whole, unknown, estimated=True)
+        return cls(errors.white, whole, slow)
 
     @property
     def level(self) -> Float:
@@ -323,7 +327,7 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
         *_without(errors, position, rotation),
         covariance,
         # Stretches are alike: the one in the middle speaks for all.
-        replace(left[len(left) // 2], assumed=prior.estimated),
+        replace(left[len(left) // 2], assumed=prior.assumed),
         results[len(results) // 2].prior,
         points,
         pixels,
