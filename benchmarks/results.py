@@ -108,7 +108,6 @@ SECTIONS = (
         "Flights are closed loops of point masses. Tilt is the elevation of cameras above the person."
         " Errors are those of joints that all arms measured.",
         (
-            Part("arms", "Adaptive against fixed", MODELLED, ""),
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
             Part("planner-worlds", "300 random worlds", MODELLED, ""),
             Part("planner-prediction", "Predicted and measured errors", MODELLED, KEPT),
@@ -284,55 +283,29 @@ def _simulated(scenario: str) -> Path:
     return place.with_suffix(".session")
 
 
-def measure_arms() -> None:
-    """Fly the sample and three scenarios by the planner's arms."""
-    rows = []
-    for name in ("sample", "mound", "wall", "trees"):
-        if name == "sample":
-            session, options = PLACE / "sample.session", "--arms adaptive,fixed,flown"
-            _run(f"mocap ingest {SAMPLE}/flight.yaml -o {session}")
-            _run(f"mocap reconstruct {session} --method robust")
-        else:
-            session = _simulated(name)
-            options = "--arms adaptive,fixed --config sample_data/planning/planner.yaml"
-        _run(f"mocap replan-compare {session} {options} --trials 5")
-        for arm, scores in read_json(session / "replan" / "metrics.json")["arms"].items():
-            error = scores["reconstruction_error"]
-            rows.append(
-                [
-                    *(name, arm),
-                    *(fixed(scores["tilt_deg"][key], 1) for key in ("mean", "max")),
-                    fixed(100 * scores["occluded_share"], 1),
-                    with_interval(error["mpjpe_mm"]),
-                    fixed(100 * error["coverage"]["mean"], 1),
-                ]
-            )
-    header = ["flight", "arm", "tilt mean deg", "max", "hidden %", "MPJPE", "measured %"]
-    keep(
-        "arms", markdown_table(header, rows), "mocap replan-compare SESSION --arms adaptive,fixed --trials 5"
-    )
-
-
 def measure_filmed() -> None:
     """Film the paper's experiments with real drones in simulation; poses err by 0.02 m and 0.2 deg."""
-    rows = []
+    rows, verdicts = [], []
     for name, (scenario, options) in FILMED.items():
         session = _simulated(scenario)
-        _run(f"mocap replan-compare {session} {options} --trials 2")
-        for arm, scores in read_json(session / "film" / "metrics.json")["arms"].items():
-            tilt = scores["tilt_deg"]
+        _run(f"mocap replan-compare {session} {options}")
+        filmed = read_json(session / "film" / "metrics.json")
+        for arm, scores in filmed["arms"].items():
+            errors = scores["reconstruction_error"]
             rows.append(
                 [
-                    *(name, arm, fixed(tilt["mean"], 1), fixed(tilt["max"], 1)),
-                    *(fixed(100 * scores[key], 0) for key in ("in_view_share", "detected_share")),
+                    *(name, arm, *(fixed(scores["tilt_deg"][key], 1) for key in ("mean", "max"))),
                     fixed(100 * scores["keypoint_pck"], 1),
-                    *(fixed(100 * scores[key], 1) for key in ("reconstructed_share", "pck150")),
-                    *(fixed(scores[key], 1) for key in ("mpjpe_mm", "root_mpjpe_mm")),
+                    fixed(100 * errors["coverage"]["mean"], 1),
+                    fixed(100 * errors["pck150"]["mean"], 1),
+                    with_interval(errors["mpjpe_mm"]),
                 ]
             )
-    header = ["experiment", "arm", "tilt mean deg", "max", "in view %", "detected %", "keypoints right %"]
-    header += ["measured %", "PCK@150 mm %", "MPJPE", "root-relative"]
-    keep("filmed", markdown_table(header, rows), "mocap replan-compare SESSION --render 5")
+        if filmed["best"] is not None:
+            verdicts.append(filmed["verdict"])
+    header = ["experiment", "arm", "tilt mean deg", "max", "keypoints right %", "measured %"]
+    header += ["PCK@150 mm %", "MPJPE"]
+    keep("filmed", [*markdown_table(header, rows), "", *verdicts], "mocap replan-compare SESSION --render 5")
 
 
 def measure_studies() -> None:
@@ -350,7 +323,6 @@ def measure_studies() -> None:
 
 MEASURES: dict[str, Callable[[], None]] = {
     "sample-poses": measure_poses,
-    "arms": measure_arms,
     "filmed": measure_filmed,
     "studies": measure_studies,
 }

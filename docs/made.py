@@ -26,7 +26,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
-from pipelines.planning.config import PlannerConfig
+from pipelines.planning.config import Imperfections, PlannerConfig
 from pipelines.session import camera_poses, registries, tables
 from pipelines.session.description import DOUBT_CODES
 from pipelines.session.manifest import FileSource, Manifest, option_models
@@ -314,13 +314,15 @@ def _cells(name: str, words: int) -> dict[str, dict[str, str]]:
 
 def planner() -> str:
     """List the settings of the planner."""
-    own = meanings(PlannerConfig)
     rows = []
-    for field in dataclasses.fields(PlannerConfig):
-        if field.name != "tuning":  # no setting
+    fields = [(PlannerConfig, "", field) for field in dataclasses.fields(PlannerConfig)]
+    fields += [(Imperfections, "imperfections.", field) for field in dataclasses.fields(Imperfections)]
+    for kind, prefix, field in fields:
+        if field.name not in ("tuning", "imperfections"):
             default = field.default if isinstance(field.default, tuple) else (field.default,)
             shown = " ".join(f"{each:g}" if isinstance(each, float) else str(each) for each in default)
-            rows.append((f"`{field.name}`", shown or "none", own[field.name]))
+            shown = "none" if field.default is None else shown
+            rows.append((f"`{prefix}{field.name}`", shown or "none", meanings(kind)[field.name]))
     return table(("key", "default", "meaning"), rows)
 
 

@@ -35,7 +35,7 @@ _settings_options = grouped(
     ),
     click.option(
         "--drones",
-        type=click.IntRange(2, 8),
+        type=click.IntRange(2, 20),
         help="Number of drones [default: the session's cameras, at least 2].",
     ),
     click.option(

@@ -20,7 +20,7 @@ from pipelines.formats.common.files import read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.comparison import ArmResult, compare
-from pipelines.planning.config import ErrorModel
+from pipelines.planning.config import ErrorModel, Imperfections
 from pipelines.planning.replay import (
     FLOWN,
     LOGGED,
@@ -61,7 +61,7 @@ from pipelines.simulation.detector_errors import (
 )
 from pipelines.simulation.scenario import DetectorErrors
 
-REPLAN_STAGE = Stage("replan", revision=9)
+REPLAN_STAGE = Stage("replan", revision=10)
 
 # The detector's errors were measured by the size of a person of this height in the picture.
 PERSON_HEIGHT_M = 1.75
@@ -256,6 +256,8 @@ def settings_by_name(settings: ReplanSettings) -> dict[str, object]:
     stated = asdict(settings)
     planner = stated.pop("planner")
     del planner["tuning"]  # no settings
+    usual, own = asdict(Imperfections()), planner.pop("imperfections")
+    planner |= {f"imperfections.{name}": value for name, value in own.items() if value != usual[name]}
     return stated | {f"planner.{name}": value for name, value in planner.items()}
 
 

@@ -29,7 +29,7 @@ from pipelines.planning.comparison import (
     mean_of_trials,
     worth_flying,
 )
-from pipelines.planning.config import SETTINGS, PlannerConfig, planner_config
+from pipelines.planning.config import MOST_DRONES, SETTINGS, PlannerConfig, planner_config
 from pipelines.planning.scene import (
     LoggedFlight,
     OtherWalk,
@@ -519,14 +519,14 @@ def _varied(stated: Stated) -> list[str]:
 
 def _replay_settings(stated: Stated) -> ReplanSettings:
     names = set(SETTINGS) - {"radius_m"}
-    unknown = [name for name in stated if name not in {*_OF_SESSION, *names}]
+    unknown = [name for name in stated if name.split(".")[0] not in {*_OF_SESSION, *names}]
     if unknown:
         remedy = f"there are {', '.join(_OF_SESSION)}, and the settings of the planner"
         raise DataError(unknown[0], "is no variable of a study of a session", remedy, code="no-such-name")
     refuse_unknown(stated.get("arm", ()), logged=False)
     numbers(stated, "range_m", float, 0.5, 500)
     numbers(stated, "tilt_deg", float, -10, 85)
-    numbers(stated, "robots", int, 2, 8)
+    numbers(stated, "robots", int, 2, MOST_DRONES)
     settings = settings_of(
         stated.get("config", ()),
         arms=None,
@@ -568,8 +568,9 @@ def _planner_of(planner: PlannerConfig, cell: Mapping[str, Any]) -> PlannerConfi
         for name, value in cell.items()
         if name not in ("arm", "robots", "actor")
     }
-    checked = planner_config(changes, "study")
-    return replace(planner, **{name: getattr(checked, name) for name in changes})
+    imperfections = asdict(planner.imperfections)
+    checked = planner_config({"imperfections": imperfections, **changes}, "study")
+    return replace(planner, **{name.split(".")[0]: getattr(checked, name.split(".")[0]) for name in changes})
 
 
 def _arm_of(cell: Mapping[str, Any]) -> str:

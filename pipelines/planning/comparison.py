@@ -420,8 +420,8 @@ def _warnings(scene: ReplayScene, results: Mapping[str, ArmResult]) -> list[str]
         gap_share = float(1.0 - result.flight.known.mean())
         if gap_share > 0:
             warnings.append(
-                f"{name}: {100 * gap_share:.1f} % of its poses lie in gaps of the log: straight ways there,"
-                " and no pictures"
+                f"{name}: {100 * gap_share:.1f} % of its poses lie in gaps of the log, or behind the end of a"
+                " battery: straight ways there, and no pictures"
             )
         if result.measured is not None and not np.isfinite(result.measured.error_m).any():
             warnings.append(f"{name}: not a single joint could be measured from its cameras")
@@ -437,6 +437,7 @@ def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) ->
         "separation": f"has two drones within {config.separation_m:g} m of each other",
         "speed": f"flies faster than {config.speed_mps:g} m/s",
         "acceleration": f"accelerates by more than {config.acceleration_mps2:g} m/s^2",
+        "battery": f"needs more than {config.imperfections.battery_kj or 0:g} kJ",
         "jerk": f"has a jerk of more than {config.jerk_mps3:g} m/s^3",
     }
     counts = scores["limit_violations"]

@@ -11,8 +11,8 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from pipelines.session.errors import DataError
 
-# Drones plan one after the other, so that more would not keep the rates.
-MOST_DRONES = 16
+# Twenty drones on a ring of 10 m are 3 m from each other.
+MOST_DRONES = 20
 
 Positive = Annotated[float, Field(gt=0, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, strict=True)]
@@ -113,6 +113,28 @@ class PlannerTuning:
 
 
 @dataclass(frozen=True)
+class Imperfections:
+    """Imperfections of a flight, none of them by default."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    # Plans are made of positions and maps that are so old.
+    latency_s: Annotated[float, Field(ge=0, le=10, strict=True)] = 0.0
+    # For this share of the time drones neither hear where the actor is, nor of new formations.
+    outage_share: Annotated[float, Field(ge=0, lt=1, strict=True)] = 0.0
+    # The wind blows to the east and north with these speeds.
+    wind_mps: tuple[float, float] = (0.0, 0.0)
+    # Gusts have this standard deviation along level axes, half of it upwards.
+    gust_mps: NotNegative = 0.0
+    # Gimbals turn no faster than this.
+    gimbal_deg_per_s: Positive | None = None
+    # Gimbals reach these elevations of the optical axis.
+    gimbal_pitch_deg: tuple[float, float] = (-90.0, 90.0)
+    # Drones film until they have used this energy.
+    battery_kj: Positive | None = None
+
+
+@dataclass(frozen=True)
 class PlannerConfig:
     """Settings of every arm. Values that come from a user go through `planner_config`, which checks them."""
 
@@ -152,6 +174,8 @@ class PlannerConfig:
     jerk_mps3: Positive = 50.0
     # The actor's acceleration has this spectral density, m²/s³: 0.1 for walking, 1.5 for jogging.
     actor_q: Positive = 0.1
+    # What a replay idealises, by keys of its own: see below.
+    imperfections: Imperfections = Imperfections()
 
     tuning: PlannerTuning = field(default=PlannerTuning(), repr=False)
 
@@ -190,15 +214,23 @@ class PlannerConfig:
 SETTINGS = tuple(each.name for each in fields(PlannerConfig) if each.name != "tuning")
 """Names of the settings, as users write them."""
 
+_DOTTED = "imperfections."
+
 _ADAPTER = TypeAdapter(PlannerConfig)
 
 
 def planner_config(values: Mapping[str, object], source: Path | str = "planner settings") -> PlannerConfig:
     """Read settings from a mapping, as from YAML; keys that are missing keep their defaults.
 
-    DataError: unknown keys, values of another type, or out of range; every problem in one message.
+    `imperfections.KEY` is one of the `Imperfections`. DataError: unknown keys, values of another type, or out
+    of range; every problem in one message.
     """
     problems = []
+    within = {key.removeprefix(_DOTTED): value for key, value in values.items() if key.startswith(_DOTTED)}
+    if within:
+        values = {key: value for key, value in values.items() if not key.startswith(_DOTTED)}
+        stated = values.get("imperfections", {})
+        values = {**values, "imperfections": {**stated, **within} if isinstance(stated, dict) else stated}
     for key in values:
         if key not in SETTINGS:
             near = difflib.get_close_matches(str(key), SETTINGS, n=1)

@@ -28,9 +28,10 @@ from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked,
 from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter, positions_at
 from pipelines.planning.formation import TILT, YAW, FormationPath, formation_slots, slot_of, slot_offsets
 from pipelines.planning.guard import FlownMotion, Guard
+from pipelines.planning.imperfections import aimed, blown, outages
 from pipelines.planning.local import DronePlan, LocalPlanner, tracking_times
 from pipelines.planning.scene import ReplayScene, planned_positions
-from pipelines.planning.scores import errors_of_views, hidden_by_people, sights
+from pipelines.planning.scores import errors_of_views, hidden_by_people, sights, used_kj
 
 # Times are sums of periods: what is due this much early is due.
 DUE_ROUNDING_S = 1e-6
@@ -39,7 +40,7 @@ DUE_ROUNDING_S = 1e-6
 class Start(NamedTuple):
     """Formation at the start of a flight."""
 
-    drones: int  # 1 to 16
+    drones: int  # 1 to 20
     yaw_rad: float = 0.0  # of the first camera, counterclockwise from east
 
 
@@ -55,6 +56,7 @@ class Replay:
     actor: Float  # [T, 3] the log, interpolated; of several people the weighted middle
     estimate: Float  # [N, T, 3] the planner's estimate of whom each camera films
     aim: Float  # [N, T, P] shares of people in the place that each camera films
+    known: Bool  # [N, T] False where a battery is empty
     safety: dict[str, int]  # local plannings by `guard.FlownMotion`
 
     @property
@@ -103,6 +105,8 @@ class Pilot:
         self._next_central_s = self._next_local_s = -np.inf
         self.guard: Guard | None = None
         """Filter of the local plans: it decides which motion is flown. Set by a replay; None otherwise."""
+        self.connected = True
+        """False while no new formation reaches the drones."""
 
     def measure(self, t_s: float, position: Float, person: int = 0) -> None:
         """Take in the position [3] of the actor or of one of several people: the hips' middle, m, world.
@@ -119,7 +123,8 @@ class Pilot:
         config = self._config
         if t_s >= self._next_central_s - DUE_ROUNDING_S:
             self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.tuning.central_hz
-            self._plan_formation(t_s, position, velocity, field)
+            if self.connected:
+                self._plan_formation(t_s, position, velocity, field)
         if t_s >= self._next_local_s - DUE_ROUNDING_S:
             self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.tuning.local_hz
             self._plan_locally(t_s, position, velocity, field)
@@ -235,9 +240,13 @@ def replay(
     log_s = (t_ns - t_ns[first]) / 1e9
     maps = sorted(fields, key=lambda field: field.from_ns)
     replay_ns = tracking_times(t_ns[first:last], config)
-    map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
+    seen_ns = replay_ns - round(1e9 * config.imperfections.latency_s)
+    map_at = np.searchsorted([field.from_ns for field in maps], seen_ns, side="right")
     fields_known = [open_space(), *maps]
-    taken_in = np.searchsorted(t_ns, replay_ns, side="right")
+    taken_in = np.maximum(np.searchsorted(t_ns, seen_ns, side="right"), first + 1)
+    times_s = (replay_ns - t_ns[first]) / 1e9
+    lost = outages(times_s, config.imperfections)
+    heard = known & ~np.append(lost, False)[np.searchsorted(times_s, log_s).clip(0, len(lost))][:, None]
 
     weight = np.array(weights, dtype=np.float64)
     pilot = Pilot(arm, config, start, weights=weights)
@@ -249,12 +258,12 @@ def replay(
     position, velocity, slots, estimate = (np.empty(shape) for _ in range(4))
     aim = np.empty((*shape[:2], len(weight)))
     done, k = first + 1, 0
-    times_s = (replay_ns - t_ns[first]) / 1e9
     while k < len(times_s):
         if taken_in[k] > done:
-            for row, person in np.argwhere(known[done : taken_in[k]]):
+            for row, person in np.argwhere(heard[done : taken_in[k]]):
                 pilot.measure(log_s[done + row], measured[done + row, person], person)
             done = int(taken_in[k])
+        pilot.connected = not lost[k]
         pilot.replan(float(times_s[k]), guard.position, guard.velocity, fields_known[map_at[k]])
         measured_next = int(np.searchsorted(taken_in, done, side="right"))
         planned_next = int(np.searchsorted(times_s, pilot.due_s))
@@ -263,15 +272,20 @@ def replay(
         slots[:, until], aim[:, until] = wanted.swapaxes(0, 1), pilot.aim[:, None]
         position[:, until], velocity[:, until] = guard.fly(until.stop - k)
         k = until.stop
+    position = blown(position, times_s, config)
+    battery_kj = config.imperfections.battery_kj
     return Replay(
         t_ns=replay_ns,
         position=position,
         velocity=velocity,
-        quaternion_xyzw=look_at(position, estimate),
+        quaternion_xyzw=aimed(position, estimate, times_s, config.imperfections),
         slots=slots,
         actor=np.tensordot(weight / weight.sum(), positions_at(t_ns, measured, replay_ns), 1),
         estimate=estimate,
         aim=aim,
+        known=np.ones(shape[:2], dtype=np.bool_)
+        if battery_kj is None
+        else used_kj(times_s, position, config) <= battery_kj,
         safety={kind.value: guard.counts[kind] for kind in FlownMotion},
     )
 
@@ -392,7 +406,7 @@ def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
         quaternion_xyzw=done.quaternion_xyzw,
         slots=done.slots,
         aim=done.aim,
-        known=np.ones(done.position.shape[:2], dtype=np.bool_),
+        known=done.known,
         safety=done.safety,
     )
 

@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics
 from pipelines.geometry.metrics import matched
@@ -20,7 +19,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rates,
 )
-from pipelines.planning.config import ErrorModel, PlannerConfig, planner_config
+from pipelines.planning.config import MOST_DRONES, ErrorModel, PlannerConfig, planner_config
 from pipelines.planning.distance_field import (
     OCCUPIED,
     DistanceField,
@@ -213,7 +212,8 @@ def walked_otherwise(flight: LoggedFlight, walk: OtherWalk, maps: Sequence[Occup
                     f"a way turned by {walk.turn_deg:.0f} deg rises by {highest_m:.1f} m within a second"
                 )
                 raise DataError("actor", problem, "turn it by another angle", code="bad-value")
-            climb_m = uniform_filter1d(steps, second, mode="nearest")
+            padded = np.pad(steps, (second // 2, second - 1 - second // 2), mode="edge")
+            climb_m = np.convolve(padded, np.ones(second) / second, "valid")
 
     def moved(stamps: Int64, at: Callable[[Int64], Float]) -> tuple[Int64, Float]:
         lasts_ns = (stamps[-1] - first_ns) / walk.speed + walk.delay_s * 1e9
@@ -456,8 +456,6 @@ def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:
     return position, rotation
 
 
-# More drones are refused, because no comparison of more was ever checked.
-MOST_DRONES = 8
 # A film of the arms has as many pictures; errors of five a second are nearly independent.
 PICTURES_HZ = 5.0
 # Errors of poses change slowly along a flight, so that the mean over 200 moments is that of all.
@@ -471,7 +469,7 @@ class ReplanSettings:
     arms: tuple[str, ...] | None = (
         None  # adaptive and fixed, flown if cameras moved, planned if commands are logged
     )
-    drones: int | None = None  # the number of cameras, 2 to 8
+    drones: int | None = None  # the number of cameras, 2 to 20
     yaw_deg: float | None = None  # of the first camera at the start, from east
     trials: int = 100
     seed: int = 0

@@ -167,7 +167,8 @@ def score(
     turned = np.array([wrapped(slots[j, :, YAW] - slots[i, :, YAW]) for i, j in pairs])
     error = errors_of_views(position, people, seen, config)
     determined = np.isfinite(error)
-    motion = _motion(t_s, position)
+    motion, energy_kj = _motion(t_s, position), used_kj(t_s, position, config)
+    battery_kj = config.imperfections.battery_kj
     limits = {"speed": config.speed_mps, "acceleration": config.acceleration_mps2, "jerk": config.jerk_mps3}
     violations = {
         "collision": _episodes(clearance <= 0.0),
@@ -175,6 +176,7 @@ def score(
         "actor": _episodes(near_m < config.actor_distance_m),
         "separation": _episodes(apart < config.separation_m) if pairs else 0,
         **{name: _episodes(motion[name] > limit * LIMIT_ROUNDING) for name, limit in limits.items()},
+        **({} if battery_kj is None else {"battery": _episodes(energy_kj > battery_kj)}),
     }
     return {
         "tilt_deg": {"mean": float(tilt_deg.mean()), "max": float(tilt_deg.max())},
@@ -183,7 +185,7 @@ def score(
         "occluded_share": float(1.0 - seen.mean()),
         "blind_s": blind_s(t_s, seen),
         "path_m": float(np.linalg.norm(np.diff(position, axis=1), axis=-1).sum(axis=1).mean()),
-        "energy_kj": _energy_j(t_s, position) / 1e3,
+        "energy_kj": float(energy_kj[:, -1].mean()),
         "min_actor_distance_m": float(near_m.min()),
         "min_clearance_m": float(clearance.min()) if _has_obstacles(maps) else None,
         "min_separation_m": float(apart.min()) if pairs else None,
@@ -266,12 +268,14 @@ def propulsion_w(level_mps: Float, climb_mps: Float) -> Float:
     return power + WEIGHT_N * np.maximum(climb_mps, 0.0)
 
 
-def _energy_j(t_s: Float, position: Float) -> float:
-    """Compute the mean energy of a drone from the mean velocities between positions at 10 Hz."""
+def used_kj(t_s: Float, position: Float, config: PlannerConfig) -> Float:
+    """Compute the energy [N, T] that each drone has used, from its mean velocities in the air at 10 Hz."""
     step_s = np.diff(_even(t_s))
     velocity = np.diff(_at_even_times(t_s, position), axis=-1) / step_s
-    power = propulsion_w(np.linalg.norm(velocity[:, :2], axis=1), velocity[:, 2])
-    return float((power * step_s).sum(axis=-1).mean())
+    wind = np.array(config.imperfections.wind_mps)[:, None]
+    power = propulsion_w(np.linalg.norm(velocity[:, :2] - wind, axis=1), velocity[:, 2])
+    used = np.cumsum(power * step_s, axis=-1) / 1e3
+    return np.array([np.interp(t_s, _even(t_s), np.concatenate([[0.0], own])) for own in used])
 
 
 def seen_actor(

@@ -14,7 +14,15 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from pipelines.geometry.arrays import RelativeTo
 from pipelines.geometry.mounting import Looks
@@ -575,6 +583,17 @@ class MapSource(ProjectedSource, FileSource):
     """Voxels that nothing is known of: free, occupied, or avoided by drones but not in a camera's way."""
     resolution_m: float | None = Field(None, gt=0)
     """Side of the voxels that a cloud of points is divided into, m."""
+
+    @field_validator("unknown", mode="before")
+    @classmethod
+    def _in_two_words(cls, stated: object) -> object:
+        """Read `{fly: no, see: yes}` as one word; nothing that hides can be flown through."""
+        if not isinstance(stated, dict) or set(stated) != {"fly", "see"}:
+            return stated
+        fly, see = (stated[key] in (True, "yes") for key in ("fly", "see"))
+        if fly:
+            return "free" if see else stated
+        return "avoided" if see else "occupied"
 
 
 class TruthSource(OwnAxes, UprightSource, MeasuredSource, DelayedSource, FileSource):

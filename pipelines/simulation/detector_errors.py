@@ -35,8 +35,14 @@ KEPT_PER_FRAME = 0.7
 MODELLED_HZ = 30.0
 """Rate of the frames of `KEPT_PER_FRAME`."""
 
-HIDDEN_MISSED_SHARE, HIDDEN_ERROR, HIDDEN_CONFIDENCE = 0.7, 4.0, 0.4
-"""Share of hidden joints that are missed; factors of the others' errors and confidences to visible ones'."""
+HIDDEN_SHARES = (0.5, 0.8, 1.0)
+"""Shares of a person's joints that obstacles hide, for which the next three lines hold."""
+HIDDEN_MISSED, HIDDEN_ERROR, HIDDEN_CONFIDENCE = (0.01, 0.53, 0.98), (1.3, 4.5, 4.5), (0.87, 0.7, 0.5)
+"""Share of hidden joints that are missed; factors of the others' errors and confidences to visible ones'.
+
+BlazePose fills in the joints of people of whom it sees half. Measured on 20,000 joints of rendered pictures,
+1,280 of them behind walls, mounds and trees, in eleven worlds.
+"""
 
 OUTLIER_SHARES = (0.2, 1.0)
 """Distance of an outlier from the truth, in heights of the person: least and most."""
@@ -130,8 +136,8 @@ def detect_keypoints(
 
     Errors have the measured median length and no preferred direction; from frame to frame they follow a
     first-order autoregression (`KEPT_PER_FRAME`). Misses and outliers come one by one, more of them the
-    steeper the camera looks. Hidden joints are mostly missed (`HIDDEN_MISSED_SHARE`, in every scenario), else
-    found with large errors. Swapped limbs (elbow to hand, knee to foot) stay so for `SWAP_FRAMES`. The mean
+    steeper the camera looks. Hidden joints are missed the more, the more of the person is hidden
+    (`HIDDEN_SHARES`). Swapped limbs (elbow to hand, knee to foot) stay so for `SWAP_FRAMES`. The mean
     confidence of visible joints is the measured one; a joint's own falls with the rank of its error among
     errors of its kind, and outliers lose up to `_OUTLIER_DOUBT` more, so that some of them look good. With
     `errors.scale` 0 all found keypoints are exact.
@@ -148,7 +154,11 @@ def detect_keypoints(
     shape = pixels.shape[:2]
     unit_error = _correlated(shape, KEPT_PER_FRAME ** (MODELLED_HZ / rate_hz), rng)
     angle, far = rng.uniform(0, 2 * np.pi, shape), rng.uniform(*OUTLIER_SHARES, shape)
-    missed = rng.random(shape) < np.where(visible, errors.missed_share * growth, HIDDEN_MISSED_SHARE)
+    hidden_share = 1.0 - visible.mean(axis=1, keepdims=True)
+    hidden = [
+        np.interp(hidden_share, HIDDEN_SHARES, of) for of in (HIDDEN_MISSED, HIDDEN_ERROR, HIDDEN_CONFIDENCE)
+    ]
+    missed = rng.random(shape) < np.where(visible, 0.0, hidden[0]) + errors.missed_share * growth
     outlier = rng.random(shape) < errors.outlier_share * growth
     doubt, noise = rng.random(shape), rng.standard_normal(shape)
     swapped = _swapped(shape[0], joints, errors.swap_share, rng)
@@ -156,14 +166,14 @@ def detect_keypoints(
         outlier, swapped = np.zeros_like(outlier), np.zeros_like(swapped)
 
     sigma_px = errors.scale * apparent_height_px[:, None] * median_share / MEDIAN_PER_SIGMA
-    ordinary = unit_error * (sigma_px * np.where(visible, 1.0, HIDDEN_ERROR))[..., None]
+    ordinary = unit_error * (sigma_px * np.where(visible, 1.0, hidden[1]))[..., None]
     gross = (far * apparent_height_px[:, None])[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     found = pixels + np.where(outlier[..., None], gross, ordinary)
 
     # The Rayleigh distribution function: uniform, so that the mean confidence is not changed by it.
     rank = np.where(outlier, 1.0, -np.expm1(-np.sum(unit_error**2, axis=-1) / 2))
     confidence = mean_confidence + _CONFIDENCE_RANGE * (0.5 - rank) - _OUTLIER_DOUBT * doubt * outlier
-    confidence = confidence * np.where(visible, 1.0, HIDDEN_CONFIDENCE) + _CONFIDENCE_NOISE * noise
+    confidence = confidence * np.where(visible, 1.0, hidden[2]) + _CONFIDENCE_NOISE * noise
     confidence = np.clip(confidence, 0.01, 1.0)
 
     found[missed] = np.nan

@@ -152,7 +152,7 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(
     against_fixed = next(each for each in metrics["differences"] if each["arm"] == "adaptive")
     assert against_fixed["against"] == "fixed"
     assert against_fixed["tilt_deg"]["interval"][1] < 0
-    assert against_fixed["mpjpe_mm"]["interval"][1] < 0
+    assert against_fixed["pck150"]["interval"][0] > 0
     # The ring goes through the mound: it is no candidate. PCK counts what was not measured as wrong.
     best = metrics["best"]
     assert (best["arms"], best["disagree"], best["left_out"]) == (["adaptive"], False, ["flown"])
@@ -396,22 +396,6 @@ def test_bad_options_get_one_line(mound: Path, case: str) -> None:
     before = content(mound)
     assert said in refused(mound, *options)
     assert content(mound) == before
-
-
-def test_bad_settings_get_one_line(mound: Path, tmp_path: Path) -> None:
-    config = tmp_path / "planner.yaml"
-    for text, said in {
-        "w_obss: 2": "did you mean 'w_obs'?",
-        "radius_m: ten": "radius_m",
-        "radius_m: -4": "radius_m",
-        "radius_m: [": "no valid YAML",
-    }.items():
-        config.write_text(text, encoding="utf-8")
-        line = refused(mound, "--config", config)
-        assert said in line
-        assert "planner.yaml" in line
-    assert "nothing.yaml" in refused(mound, "--config", tmp_path / "nothing.yaml")
-    assert f"{tmp_path}: " in refused(tmp_path)
 
 
 PARTING = """

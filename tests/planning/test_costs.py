@@ -7,16 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.planning.config import ErrorModel, PlannerConfig, PlannerTuning
-from pipelines.planning.distance_field import distance_field, in_turn, visible
+from pipelines.planning.config import PlannerConfig, PlannerTuning
+from pipelines.planning.distance_field import distance_field, visible
 from pipelines.planning.formation import (
     FormationPath,
     cost_map,
     costs_of_slots,
     formation_slots,
     slot_offsets,
-    wrapped,
-    yaw_set,
 )
 from pipelines.planning.scores import log_determinant, predicted_error, ray_information
 from pipelines.session.records import Occupancy
@@ -45,21 +43,6 @@ def test_what_the_ends_of_a_line_tell_changes_no_cost(seed: int, share: float, e
     assert (costs.occluded == expected).mean() > 0.95
     total = (2 * costs.obstacle + 3 * costs.occluded).sum(axis=2)
     assert cost_map(costs, CONFIG) == pytest.approx(total, abs=1e-12)
-
-
-def test_error_of_two_cameras_as_in_closed_form() -> None:
-    """Tr S = s^2 (1/2 + 2/sin^2 gamma) for equal cameras whose rays cross at gamma."""
-    errors = ErrorModel(rotation_sigma_deg=0.8)
-    offset = np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
-    for gamma in np.radians([30.0, 60.0, 90.0, 150.0]):
-        offset[1] = 10 * np.array([np.cos(gamma), np.sin(gamma), 0.0])
-        keypoint_m, placed = (
-            np.interp(0.0, errors.tilts_deg, values)
-            for values in (errors.keypoint_sigma_m, errors.placed_share)
-        )
-        s2 = keypoint_m**2 + (10 * np.radians(0.8)) ** 2 + errors.position_sigma_m**2
-        error = predicted_error(ray_information(offset, errors).sum(axis=0))
-        assert error**2 == pytest.approx(s2 / placed * (0.5 + 2 / np.sin(gamma) ** 2), rel=1e-9)
 
 
 @given(st.integers(0, 10_000))
@@ -103,14 +86,6 @@ def test_gradient_is_the_derivative_of_the_interpolated_value() -> None:
         assert np.abs(gradient[:, axis] - numeric).max() < 1e-8
 
 
-def test_unknown_is_free_or_occupied_as_asked() -> None:
-    point = np.array([0.0, 0.0, 3.0])
-    assert distance_field(slab(unknown_above=True)).sample(point)[0] == pytest.approx(2.0, abs=1e-5)
-    blocked = distance_field(slab(unknown_above=True), unknown="occupied")
-    assert blocked.sample(point)[0] == pytest.approx(-1.0, abs=1e-5)
-    assert blocked.from_ns == 7
-
-
 def test_cameras_see_through_what_drones_avoid() -> None:
     """Look down through the unknown at a place above the slab: clearance as if occupied, sight as if free."""
     camera, actor = np.array([[0.0, 0.0, 3.8]]), np.array([[0.0, 0.0, 1.3]])
@@ -125,21 +100,6 @@ def test_cameras_see_through_what_drones_avoid() -> None:
     np.testing.assert_array_equal(fields["avoided"].sight.bricks, fields["free"].sight.bricks)
 
 
-def test_each_map_holds_from_its_own_time_on() -> None:
-    t_ns = np.arange(10, dtype=np.int64)
-    first, second = (
-        distance_field(Occupancy(slab().probability, np.zeros(3), RES, from_ns=n)) for n in (3, 6)
-    )
-    assert [(rows, field) for rows, field in in_turn([first, second], t_ns)][1:] == [
-        (slice(3, 6), first),
-        (slice(6, 10), second),
-    ]
-    assert not in_turn([first, second], t_ns)[0][1].has_obstacles
-    assert [rows for rows, _ in in_turn([first, second], t_ns[4:])] == [slice(0, 2), slice(2, 6)]
-    assert [rows for rows, _ in in_turn([first, second], t_ns[:2])] == [slice(0, 2)]
-    assert [rows for rows, _ in in_turn([], t_ns)] == [slice(0, 10)]
-
-
 RATES = np.array([np.radians(22.5), np.radians(5.0), 1.0])
 
 
@@ -151,16 +111,6 @@ def test_slots_are_evenly_spaced_but_for_two(drones: int, apart_deg: float) -> N
     offsets = slot_offsets(slots)
     assert np.linalg.norm(offsets, axis=-1) == pytest.approx(np.full((2, drones), 10.0))
     assert offsets[..., 2] == pytest.approx(np.full((2, drones), 10 * np.sin(0.25)))
-
-
-@given(st.integers(1, 72), st.floats(-10, 10))
-def test_yaws_are_equidistant_and_hold_the_start(yaws: int, start: float) -> None:
-    cells = yaw_set(yaws, start)
-    assert (cells >= -np.pi).all()
-    assert (cells < np.pi).all()
-    assert np.abs(wrapped(cells - start)).min() < 1e-9
-    gaps = np.diff(np.append(cells, cells[0] + 2 * np.pi))
-    assert gaps == pytest.approx(np.full(yaws, 2 * np.pi / yaws))
 
 
 def test_knots_are_approached_at_the_full_rate_and_then_waited_for() -> None:

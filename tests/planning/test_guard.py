@@ -6,11 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
+from pipelines.planning.arms import FIXED
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field, open_space
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.guard import FlownMotion, Guard, least_distances, wanted_clearance_m
 from pipelines.planning.local import DronePlan
+from pipelines.planning.replay import Start, replay
 from pipelines.session.records import Occupancy
 from tests.synthetic.worlds import fly, world_of
 
@@ -138,6 +140,18 @@ def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
             guard.fly(1)
     assert nearest >= CONFIG.actor_distance_m
     assert guard.counts[FlownMotion.GAVE_WAY] + guard.counts[FlownMotion.CLIMBED] > 0
+
+
+@pytest.mark.parametrize("yaw_deg", [180.0, 90.0])
+def test_somebody_who_turns_back_at_a_run_is_kept_away_from(yaw_deg: float) -> None:
+    """They run at 5 m/s towards east, and after 6 s towards the drones of the arm that follows them."""
+    t_s = np.arange(0.0, 12.0, 0.1)
+    east = 5.0 * (t_s - 2.0 * np.maximum(t_s - 6.0, 0.0))
+    hips = np.stack([east, 0 * t_s, 0 * t_s + 1.0], axis=1)
+    config = PlannerConfig(radius_m=8.0, actor_q=1.5)
+    start = Start(2, np.radians(yaw_deg))
+    done = replay(FIXED, (t_s * 1e9).astype(np.int64), hips, [open_space()], start, config=config)
+    assert np.linalg.norm(done.position - done.actor, axis=-1).min() >= config.actor_distance_m
 
 
 @pytest.mark.slow

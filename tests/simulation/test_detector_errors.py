@@ -12,7 +12,7 @@ from pipelines.session.people import mirrored
 from pipelines.simulation.detector_errors import (
     HIDDEN_CONFIDENCE,
     HIDDEN_ERROR,
-    HIDDEN_MISSED_SHARE,
+    HIDDEN_MISSED,
     KEPT_PER_FRAME,
     OUTLIER_SHARES,
     SWAP_FRAMES,
@@ -110,13 +110,13 @@ def test_misses_and_outliers_grow_with_the_tilt(tilt_deg: float, growth: float) 
 
 
 def test_hidden_joints_are_mostly_missed_and_else_bad() -> None:
-    """Of 102,000 about 30,600 are found, whose errors count as 5,500: their median is known to 1 %."""
+    """Of 102,000 about 2,000 are found, whose errors count as 370: their median is known to 5 %."""
     xy, confidence = detect(CLEAN, hidden=True)
     length = lengths(xy)
-    assert np.isnan(length).mean() == pytest.approx(HIDDEN_MISSED_SHARE, abs=0.006)
-    assert np.nanmedian(length) == pytest.approx(HIDDEN_ERROR * 0.0192 * HEIGHT_PX, rel=0.04)
+    assert np.isnan(length).mean() == pytest.approx(HIDDEN_MISSED[-1], abs=0.006)
+    assert np.nanmedian(length) == pytest.approx(HIDDEN_ERROR[-1] * 0.0192 * HEIGHT_PX, rel=0.15)
     seen = confidence[~np.isnan(length)]
-    assert seen.mean() == pytest.approx(HIDDEN_CONFIDENCE * 0.89, abs=0.01)
+    assert seen.mean() == pytest.approx(HIDDEN_CONFIDENCE[-1] * 0.89, abs=0.01)
 
 
 # --- swaps ---------------------------------------------------------------------------------------------
