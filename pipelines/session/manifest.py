@@ -225,12 +225,12 @@ class FileSource(Guess):
 
     @model_validator(mode="after")
     def _options_exist(self) -> FileSource:
-        if self.needs_file and not self.file:
-            raise ValueError("file: is missing")
         known = option_names(self.part)
         for key in self.options:
             if key not in known:
                 raise ValueError(f"{key}: {unknown_key(key, [*type(self).model_fields, *known])}")
+        if self.needs_file and not self.file:
+            raise ValueError("file: is missing")
         return self
 
     @property

@@ -122,6 +122,7 @@ _UNREAD = (
     (re.compile(rb"P[1-6]\s"), "a PGM picture", "of a floor plan, name the .yaml beside it"),
     (re.compile(rb"(?s).{4}ftyp|\x1aE\xdf\xa3|RIFF....AVI "), "a video without pictures", _COPY),
     (re.compile(rb"%PDF"), "a PDF document", ""),
+    (re.compile(rb"\x37\x7f\x06[\x82\x83]"), "the write-ahead log of a database", "name the .db3 beside it"),
     (re.compile(rb"PK\x03\x04.{26}[\w.-]{1,60}\.npy", re.DOTALL),
      "a NumPy archive of other arrays than a map's",
      "a map has probability or occupancy, origin and resolution_m; save a calibration as YAML, poses as CSV"),

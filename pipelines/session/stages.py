@@ -550,7 +550,8 @@ def was_interrupted(folder: Path) -> bool:
 
 def tidy(folder: Path) -> None:
     """Remove what a kill left of making a stage, if the session can be written."""
-    if any(_new_folder(folder, stage).exists() for stage in STAGES):
+    left = [_new_folder(folder, stage) for stage in STAGES]
+    if any(new.exists() and not new.is_symlink() for new in left):
         with suppress(MocapError), locked(folder):
             pass
 
