@@ -10,7 +10,7 @@ centimetres, it stands on the ground, its joints have ranges, and it moves smoot
 - accelerations of the root and angular accelerations of the bones are normal, bounded (Cauchy);
 - the prior of the stature is narrow.
 
-Moments are 0.1 s apart. A second difference couples three of them; two moments make one block of a block
+Moments are 0.2 s apart. A second difference couples three of them; two moments make one block of a block
 tridiagonal matrix, which is eliminated in the order of time. Shape, offsets and level are its border. A
 single view of a limb fits two poses, towards the camera and away from it. So each moment is first fitted by
 itself from the likeliest of eight headings, and the smoothest sequence is chosen (Viterbi).
@@ -58,15 +58,15 @@ STATED_STATURE_SIGMA_M = 0.02
 # Of a level that nobody knows: it is determined by the stature alone.
 UNKNOWN_LEVEL_SIGMA_M = 100.0
 
-# People move little in a tenth of a second, and a detector's errors are alike.
-_MOMENT_NS = 100_000_000
+# People move little in a fifth of a second, and a detector's errors are alike.
+_MOMENT_NS = 200_000_000
 # Between moments that are further apart a person is not interpolated.
-_LONGEST_GAP_NS = 350_000_000
+_LONGEST_GAP_NS = 450_000_000
 # So many moments are fitted at once, a minute; the others have what these show of shape and ground as prior.
-_WINDOW, _OVERLAP = 600, 10
-# Landmarks of neighbouring moments err alike, so a moment counts less: 2.5 is the root of (1 + r) / (1 - r)
-# with the correlation r of 0.7 after 0.1 s on the tuning flights.
-_ALIKE = 2.5
+_WINDOW, _OVERLAP = 300, 5
+# Landmarks of neighbouring moments err alike, and so do accelerations. A moment of both counts less: 1.7 is
+# the root of (1 + r) / (1 - r) with the correlation r of 0.5 after 0.2 s on the tuning flights.
+_ALIKE = 1.7
 # Pelvises of recorded people who walk, crouch and dance tilt by less in 19 of 20 moments.
 _UPRIGHT_RAD = np.radians(20.0)
 # Soles are flat and stiff in the body, and neither in people.
@@ -359,7 +359,7 @@ class _Motion(NamedTuple):
 def _precision_of_motion() -> Float:
     """Return the precisions [D] of accelerations."""
     parts = [name.removeprefix("left_").removeprefix("right_") for name in BONES]
-    sigma = np.repeat([_ROOT_MPS2, *(_BONE_RADPS2[part] for part in parts)], 3)
+    sigma = _ALIKE * np.repeat([_ROOT_MPS2, *(_BONE_RADPS2[part] for part in parts)], 3)
     return np.asarray(sigma**-2, np.float64)
 
 
