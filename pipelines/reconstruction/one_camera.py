@@ -4,16 +4,16 @@ Rays of one camera do not show how far away a person is. The body does: its stat
 centimetres, it stands on the ground, its joints have ranges, and it moves smoothly. The fit is that of
 `body_fit`, with the directions of landmarks in the place of their positions, and with four more terms:
 
-- the pelvis is upright to some 20 degrees;
-- the lowest point of the soles is on the ground, and no other one is below it. How much higher the ground is
-  than thought, in the frame of the camera's log, is an unknown that all moments share;
+- the pelvis is upright to some 20 degrees, bounded (Cauchy);
+- the lowest point of soles, knees and fingertips is on the ground, and no other is below it. How much
+  higher the ground is than thought, in the frame of the camera's log, is an unknown that all moments share;
 - accelerations of the root and angular accelerations of the bones are normal, bounded (Cauchy);
 - the prior of the stature is narrow.
 
 Moments are 0.2 s apart. A second difference couples three of them; two moments make one block of a block
 tridiagonal matrix, which is eliminated in the order of time. Shape, offsets and level are its border. A
 single view of a limb fits two poses, towards the camera and away from it. So each moment is first fitted by
-itself from the likeliest of eight headings, and the smoothest sequence is chosen (Viterbi).
+itself from the likeliest of eight headings, upright or not, and the smoothest sequence is chosen (Viterbi).
 """
 
 from __future__ import annotations
@@ -263,8 +263,8 @@ def _poses_of(poses: Poses, part: Index | slice | Bool) -> Poses:
 
 
 @cache
-def _soles() -> tuple[Index, Float]:
-    """Return bones [6] and offsets [6, 3] of heel and ball of both feet, and of their toes' tips."""
+def _contacts() -> tuple[Index, Float]:
+    """Return bones [10] and offsets [10, 3] of heels, balls, toes' tips, knees and fingertips."""
     model = body_model()
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1))
     surface = model.surface(np.array([1.0, *np.zeros(11)]), np.zeros(3), upright)
@@ -279,6 +279,11 @@ def _soles() -> tuple[Index, Float]:
                 bones.append(bone)
                 point = np.array([end(lowest[:, 0]), lowest[:, 1].mean(), own[:, 2].min()])
                 offsets.append(point - centres[bone])
+        for part in ("shank", "hand"):
+            bone = BONE[f"{side}_{part}"]
+            own = surface[model.weights.argmax(axis=1) == bone] - centres[bone]
+            bones.append(bone)
+            offsets.append(own[(own[:, 0] if part == "shank" else np.linalg.norm(own, axis=1)).argmax()])
     return np.array(bones), np.array(offsets)
 
 
@@ -288,26 +293,27 @@ class StandingPoints(Points):
     def __init__(self, landmarks: Landmarks, ground: GroundHeight, stature_m: tuple[float, float]) -> None:
         super().__init__(body_model(), landmarks)
         self.ground = ground
-        self.soles = self.model.reach(*_soles())  # [12, 6, 22, 3]
+        self.contacts = self.model.reach(*_contacts())  # [12, 10, 22, 3]
         precision, mean = self.prior.precision.copy(), self.prior.mean.copy()
         mean[0] = stature_m[0]
         precision[0, 0], precision[-1, -1] = stature_m[1] ** -2, ground.sigma_m**-2
         self.prior = SharedPrior(mean, precision)
 
     def normal(self, poses: Poses, seen: Places | Rays, shared: Shared, *, whole: bool) -> Normal:
-        """Add what holds the pelvis upright and the soles on the ground."""
+        """Add what holds the pelvis upright and the lowest point on the ground."""
         found = super().normal(poses, seen, shared, whole=whole)
-        upright, weight = poses.turn[:, 0, :, 2], np.sin(_UPRIGHT_RAD) ** -2
-        slope = -cross_matrix(upright)[:, :2]
-        found.pose[:, 3:6, 3:6] += weight * np.swapaxes(slope, 1, 2) @ slope
-        found.pose_right[:, 3:6] -= weight * (np.swapaxes(slope, 1, 2) @ upright[:, :2, None])[..., 0]
-        cost = found.cost + weight * (upright[:, :2] ** 2).sum(axis=1)
+        away, lying = _lying(poses.turn)
+        slope = -cross_matrix(poses.turn[:, 0, :, 2]) / _UPRIGHT_RAD
+        transposed = np.swapaxes(slope, 1, 2) / np.exp(lying)[:, None, None]
+        found.pose[:, 3:6, 3:6] += transposed @ slope
+        found.pose_right[:, 3:6] -= (transposed @ away[..., None])[..., 0]
+        cost = found.cost + lying
 
         stature, count = shared.shape[0], len(poses.root)
-        vectors = np.tensordot(np.array([1.0, *shared.shape[1:]]), self.soles, 1)
+        vectors = np.tensordot(np.array([1.0, *shared.shape[1:]]), self.contacts, 1)
         arms = np.einsum("nbij,kbj->nkbi", poses.turn, vectors, optimize=True)
-        sole = poses.root[:, None] + stature * arms.sum(axis=2)
-        height = sole[..., 2] - self.ground.under(sole.reshape(-1, 3)).reshape(count, -1) - shared.level_m
+        point = poses.root[:, None] + stature * arms.sum(axis=2)
+        height = point[..., 2] - self.ground.under(point.reshape(-1, 3)).reshape(count, -1) - shared.level_m
         touching = (height < 0) | (height == height.min(axis=1, keepdims=True))
         # Relative to the stature: else the smallest body would stand best.
         sigma_m = _CONTACT_SIGMA_M * stature / MEAN_SHAPE[0]
@@ -329,7 +335,7 @@ class StandingPoints(Points):
         by_shared[..., 0] = arms.sum(axis=2)[..., 2] - height / stature
         by_shared[..., -1] = -1.0
         by_shared[..., 1:12] = stature * np.einsum(
-            "nbj,mkbj->nkm", poses.turn[:, :, 2], self.soles[1:], optimize=True
+            "nbj,mkbj->nkm", poses.turn[:, :, 2], self.contacts[1:], optimize=True
         )
         by_shared *= bounded[..., None]
         flat = by_shared.reshape(-1, by_shared.shape[-1])
@@ -341,6 +347,12 @@ class StandingPoints(Points):
             found.shared_right - flat.T @ error.ravel(),
             found.between + transposed @ by_shared,
         )
+
+
+def _lying(turn: Float) -> tuple[Float, Float]:
+    """Return how far pelvises point away from upwards [N, 3], and the cost [N], which is bounded (Cauchy)."""
+    away = (turn[:, 0, :, 2] - [0.0, 0.0, 1.0]) / _UPRIGHT_RAD
+    return away, np.log1p((away**2).sum(axis=1))
 
 
 # --- motion --------------------------------------------------------------------------------------------
@@ -485,20 +497,27 @@ class _Chain:
 
 
 def _usual_turns() -> Float:
-    """Return rotations [H, 22, 3, 3] of a body in its usual posture, which looks into H directions."""
+    """Return rotations [H, 22, 3, 3] of a body in its usual posture: upright, upside down and lying."""
     usual = joint_ranges()
     turn = np.zeros((len(BONES), 3, 3))
     turn[0] = np.eye(3)
     bent = matrix_from_quaternion(quaternion_from_rotation_vector(usual.usual))
     for k, (bone, parent) in enumerate(zip(usual.bone.tolist(), usual.parent.tolist(), strict=True)):
         turn[bone] = turn[parent] @ usual.middle[k] @ bent[k]
-    heading = np.zeros((_HEADINGS, 3))
+    heading, tilts = np.zeros((_HEADINGS, 3)), np.zeros((4, 3))
     heading[:, 2] = np.arange(_HEADINGS) * (2 * np.pi / _HEADINGS)
-    return np.asarray(matrix_from_quaternion(quaternion_from_rotation_vector(heading))[:, None] @ turn)
+    tilts[1:, 1] = np.pi, np.pi / 2, -np.pi / 2  # on the head, the face and the back
+    headings, tilted = (matrix_from_quaternion(quaternion_from_rotation_vector(v)) for v in (heading, tilts))
+    first = headings[:, None] @ tilted
+    return np.asarray(first.reshape(-1, 1, 3, 3) @ turn)
 
 
 def _roots(points: StandingPoints, rays: Rays, turns: Float) -> tuple[Float, Float]:
     """Place bodies [H] of one posture nearest to the rays: errors [H, N], and roots from the camera."""
+    if len(rays.camera) > _WINDOW:  # arrays of all landmarks and postures are large
+        half = np.array_split(np.arange(len(rays.camera)), 2)
+        (one, first), (other, second) = (_roots(points, _of(rays, part), turns) for part in half)
+        return np.concatenate([one, other], axis=1), np.concatenate([first, second], axis=1)
     stature, seen = points.prior.mean[0], np.asarray(rays.direction.any(axis=-1))[..., None, None]
     across = np.where(seen, np.eye(3) - rays.direction[..., None] * rays.direction[..., None, :], 0.0)
     arms = stature * np.einsum("hbij,kbj->hki", turns, points.reach[0], optimize=True)
@@ -508,7 +527,7 @@ def _roots(points: StandingPoints, rays: Rays, turns: Float) -> tuple[Float, Flo
     away = np.einsum("nkij,hnkj->hnki", across, point, optimize=True)
     depth = np.maximum(np.sum(point * rays.direction, axis=-1), 0.1)
     error = np.sum(away**2, axis=-1) / (depth * rays.sigma) ** 2
-    return np.log1p(error).sum(axis=-1), root
+    return np.log1p(error).sum(axis=-1) + _lying(turns)[1][:, None], root
 
 
 def _first_poses(points: StandingPoints, rays: Rays, turns: Float, t_s: Float) -> tuple[Poses, float]:
@@ -517,7 +536,7 @@ def _first_poses(points: StandingPoints, rays: Rays, turns: Float, t_s: Float) -
     root = root + rays.camera
     level = 0.0
     if points.ground.sigma_m >= UNKNOWN_LEVEL_SIGMA_M:
-        sole = points.soles[0].sum(axis=1)[:, 2].min()
+        sole = points.contacts[0].sum(axis=1)[:, 2].min()
         likeliest = root[error.argmin(axis=0), np.arange(len(t_s))]
         level = float(np.median(likeliest[:, 2]) + points.prior.mean[0] * sole)
     shared = Shared(points.prior.mean[:12].copy(), np.zeros((len(points.bone), 3)), level)
