@@ -203,7 +203,7 @@ def test_one_camera_places_a_person_as_well_as_it_says(
         turn[:, bone] = turn[:, parent] @ usual.middle[k] @ relative
     shape = MEAN_SHAPE + 0.5 * SHAPE_SIGMA * rng.normal(size=len(MEAN_SHAPE))
     shape[0] = 1.76
-    soles = np.tensordot([1.0, *shape[1:]], points.soles, 1)
+    soles = np.tensordot([1.0, *shape[1:]], points.contacts, 1)
     sole = shape[0] * np.einsum("nbij,kbj->nki", turn, soles)[..., 2].min(axis=1)
     poses = Poses(np.stack([0.4 * t_s, 0.3 * t_s, -sole], axis=1), turn)
     place = places(points, poses, Shared(shape, np.zeros(landmarks.offset.shape)))
