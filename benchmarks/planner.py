@@ -1,15 +1,14 @@
-"""The planner: safety in random worlds, predicted errors, and filming of groups.
+"""The planner: safety in random worlds, modelled and filmed differences, and filming of groups.
 
     python -m benchmarks.planner worlds [--first 0] [--count 300]       # exit 1 if a drone touches anything
-    python -m benchmarks.planner prediction [--first 1000] [--count 20] # predicted against measured errors
     python -m benchmarks.planner filming              # published plans, needs MOCAP_REAL_DATA
+    python -m benchmarks.planner films [--first 0] [--count 10]         # modelled against filmed differences
     python -m benchmarks.planner groups [--seeds 10 11 12 13 14 15]     # people who walk apart and come back
 
 Worlds have walls down to one voxel, boxes, forests, hills and overhangs; flights are checked against their
 analytic surfaces. Worlds 1000 to 1999 were tuned on; those from 2000 on are kept aside.
 
-prediction: one posture of a walk is measured by triangulation with modelled keypoints and white pose noise,
-and the ray model predicts the error. filming: the scenes of Hughes et al. 2024, four robots that jump from
+filming: the scenes of Hughes et al. 2024, four robots that jump from
 cell to cell of a grid of 1 m, 4 to 6 people who move. Their planners' solutions are scored with
 `view_quality`, and so are plans of the arm `group` from the same starts, under the same limits. groups:
 `first` is `adaptive` with the weight of all others 0.
@@ -20,33 +19,27 @@ import csv
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from benchmarks.flights import REAL_DATA, scenario_of, walker
 from benchmarks.results import fixed, markdown_table, parser_of, show
+from pipelines.film import FilmSettings, film
 from pipelines.formats.common.files import read_yaml
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.noise import White
 from pipelines.ingest import ingest
-from pipelines.planning.arms import PLANNER_ARMS, SlotChoice, Worth, plan_in_turn
-from pipelines.planning.config import PlannerConfig, PlannerTuning
+from pipelines.planning.arms import SlotChoice, Worth, plan_in_turn
+from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import Lattice
-from pipelines.planning.replay import CameraPaths, Start, measure, replay
 from pipelines.planning.scene import ReplanSettings
-from pipelines.planning.scores import coverage, predicted_errors, score, view_quality
-from pipelines.replan import detect_by_model, error_model, replan
+from pipelines.planning.scores import coverage, view_quality
+from pipelines.replan import replan
 from pipelines.simulate import simulate
-from pipelines.simulation.scenario import DetectorErrors, Lens
-from pipelines.simulation.walks import walk
-from tests.synthetic.worlds import ARMS, flown, world_of
+from tests.synthetic.worlds import ARMS, flown
 
 _CONFIG = PlannerConfig()
 Lines = list[str]
@@ -86,115 +79,6 @@ def worlds(options: argparse.Namespace) -> Lines:
     if trouble:
         sys.exit("\n".join([*lines, *trouble]))
     return lines
-
-
-# --- predicted and measured errors -----------------------------------------------------------------------
-
-NEAREST_M = 8.0
-FLOWN: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "fixed": ("fixed", {}),
-    "adaptive": ("adaptive", {}),
-    "joint, 10 m only": ("joint", {"ranges_m": (10.0,)}),
-    "adaptive, 8 m": ("adaptive", {"radius_m": NEAREST_M}),
-    "joint": ("joint", {}),
-    "joint, from 8 m": ("joint", {"radius_m": NEAREST_M}),
-}
-"""Arms by their names in the table: the planner's arm, and changes of its settings."""
-_NOISE = White(position_m=0.02, rotation_deg=0.2)
-_EVERY = 2  # tracking steps from picture to picture
-
-
-@dataclass(frozen=True)
-class Predicted:
-    """One arm in one world: errors in mm of each second, NaN where nothing was determined."""
-
-    predicted: Float
-    measured: Float
-    hidden: float
-    range_m: float
-
-
-def predict(seed: int) -> dict[str, Predicted]:
-    """Fly all arms through one world; predict and measure their errors."""
-    world = world_of(seed)
-    field = world.field()
-    walking = walk(1.0, 2.0, seed=0)
-    names, posture = walking.person.joints, walking.joints[0] - walking.motion.root[0]
-    errors = replace(
-        error_model(DetectorErrors(), names),
-        position_sigma_m=_NOISE.position_m,
-        rotation_sigma_deg=_NOISE.rotation_deg,
-    )
-    lens = Lens().intrinsics()
-    start = Start(world.drones, world.yaw_rad)
-    rows = slice(None, None, _EVERY)
-    found = {}
-    for arm, (name, changes) in FLOWN.items():
-        config = PlannerConfig(tuning=PlannerTuning(errors=errors), **changes)
-        done = replay(PLANNER_ARMS.get(name), world.actor_t_ns, world.actor, [field], start, config=config)
-        joints, place, actor = done.actor[rows, None] + posture, done.position[:, rows], done.actor[rows]
-        measured = measure(
-            CameraPaths(
-                t_ns=done.t_ns[rows],
-                position=place,
-                quaternion_xyzw=done.quaternion_xyzw[:, rows],
-                known=np.ones((world.drones, len(joints)), dtype=np.bool_),
-                intrinsics=[lens] * world.drones,
-                noise=[[_NOISE]] * world.drones,
-                joints=joints,
-                middle=actor,
-            ),
-            field,
-            partial(detect_by_model, joints=names, errors=DetectorErrors()),
-            start_m=config.tuning.sight_start_m,
-            trials=32,
-            seed=seed,
-        )
-        predicted = predicted_errors(place, actor, field, config)
-        second = done.t_s[rows].astype(int)
-        of_each = np.moveaxis(measured.error_m, 1, 0).reshape(len(second), -1).astype(np.float64)
-        figures = score(done.t_s, done.position, done.actor, field, config)
-        found[arm] = Predicted(
-            _by_second(np.where(np.isfinite(predicted), predicted, np.nan), second),
-            _by_second(of_each, second),
-            float(str(figures["occluded_share"])),
-            float(np.linalg.norm(done.position - done.actor, axis=-1).mean()),
-        )
-    return found
-
-
-def _by_second(values: Float, second: Float) -> Float:
-    """Average finite values [T] or [T, K] of each second, in mm; NaN where there are none."""
-    rows = pd.DataFrame(values).groupby(second)
-    return 1e3 * (rows.sum().sum(axis=1) / rows.count().sum(axis=1)).to_numpy()
-
-
-def prediction(options: argparse.Namespace) -> Lines:
-    """Compare predicted with measured errors."""
-    first = options.first or 1000
-    with ProcessPoolExecutor(options.workers) as pool:
-        found = list(pool.map(predict, range(first, first + (options.count or 20))))
-    rows = []
-    for arm in FLOWN:
-        own = [world[arm] for world in found]
-        measured = np.array([np.nanmean(one.measured) for one in own])
-        rows.append(
-            [
-                *(arm, fixed(float(np.mean([one.range_m for one in own])), 1)),
-                *(fixed(float(measured.mean()), 1),),
-                fixed(float(np.mean([np.nanmean(one.predicted) for one in own])), 1),
-                fixed(100 * float(np.mean([one.hidden for one in own])), 2),
-            ]
-        )
-    means = np.array(
-        [[np.nanmean(one.predicted), np.nanmean(one.measured)] for w in found for one in w.values()]
-    )
-    header = ["arm", "range m", "measured mm", "predicted mm", "hidden %"]
-    return [
-        *markdown_table(header, rows),
-        "",
-        f"Correlation over {len(means)} flights: {np.corrcoef(*means.T)[0, 1]:.3f}.",
-    ]
 
 
 # --- published plans of groups ---------------------------------------------------------------------------
@@ -380,10 +264,46 @@ def groups(options: argparse.Namespace) -> Lines:
     return markdown_table([*header, "limits violated"], rows)
 
 
+# --- modelled and filmed differences ---------------------------------------------------------------------
+
+
+def films(options: argparse.Namespace) -> Lines:
+    """Compare `adaptive` with `fixed` beside a mound, as modelled and as filmed (some minutes a world)."""
+    rows = []
+    for seed in range(options.first or 0, (options.first or 0) + (options.count or 10)):
+        rng = np.random.default_rng([2026, seed])
+        plan = scenario_of({"one": walker(-6, 0, 0, {"walk": {"distance_m": 14, "speed_mps": 1.6}})}, seed)
+        mound = {"centre": [2, float(rng.choice([-8, 8]))], "sigma_m": rng.uniform(2, 5, 2).tolist()}
+        plan["world"] |= {"mounds": [mound | {"height_m": float(rng.uniform(4, 8))}]}
+        plan["drones"] |= {
+            "count": 2,
+            "camera": {"rate_hz": 5},
+            "pose_noise": {"white": {"rotation_deg": 0.3}},
+        }
+        plan["drones"]["formation"] = {"yaw_deg": float(np.sign(mound["centre"][1]) * rng.uniform(30, 100))}
+        with tempfile.TemporaryDirectory(prefix="films-") as place:
+            scenario = Path(place) / "scenario.yaml"
+            scenario.write_text(json.dumps(plan), encoding="utf-8")
+            simulate(scenario, Path(place) / "flight", video=False)
+            session = ingest(Path(place) / "flight" / "flight.yaml", Path(place) / "one.session").folder
+            modelled = replan(session, ReplanSettings(arms=("adaptive", "fixed"))).metrics["best"]
+            filmed = film(session, FilmSettings(), scenario=Path(place) / "flight" / "scenario.yaml")
+        row = [str(seed)]
+        for best in (modelled, filmed.metrics["best"]):
+            sign = 1 if best["difference"]["arm"] == "adaptive" else -1
+            for figure, scale in (("pck150", 100), ("mpjpe_mm", 1)):
+                row.append(fixed(sign * scale * best["difference"][figure]["mean"], 1))
+        rows.append(row)
+    figures = np.array([[float(cell) for cell in row[1:]] for row in rows])
+    said = [f"{np.corrcoef(figures[:, k], figures[:, k + 2])[0, 1]:.2f}" for k in range(2)]
+    header = ["world", "modelled, points", "modelled, mm", "filmed, points", "filmed, mm"]
+    return [*markdown_table(header, rows), "", f"Correlations: {said[0]} of points, {said[1]} of mm."]
+
+
 SUBJECTS: dict[str, tuple[Callable[[argparse.Namespace], Lines], str]] = {
     "worlds": (worlds, "planner-worlds"),
-    "prediction": (prediction, "planner-prediction"),
     "filming": (filming, "planner-filming"),
+    "films": (films, "planner-films"),
     "groups": (groups, "planner-groups"),
 }
 

@@ -110,7 +110,7 @@ SECTIONS = (
         (
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
             Part("planner-worlds", "300 random worlds", MODELLED, ""),
-            Part("planner-prediction", "Predicted and measured errors", MODELLED, KEPT),
+            Part("planner-films", "Modelled and filmed differences", RENDERED, KEPT),
             Part("planner-filming", "View quality of published plans, and of ours", REAL, ""),
             Part("planner-groups", "Groups that split", MODELLED, KEPT),
         ),
