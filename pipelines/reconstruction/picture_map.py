@@ -97,10 +97,14 @@ LOSS_ROUNDS_PX = (30.0, 6.0, 2.0)
 SIGHTINGS_ALIKE = 64.0
 # Sightings err by this where residuals are smaller (features of photographs).
 MIN_SIGHTING_PX = 0.2
-# An adjustment of the start of a right map takes ten steps, that of a bent one fifty.
-MAX_STEPS = 100
+# Places by satellites leave a map so loose that its adjustment takes a hundred steps; with RTK it takes ten.
+MAX_STEPS = 300
 # A tenth of the smallest standard deviation of an attitude.
 CONVERGED_RAD = 1e-4
+# A cost, in squares of standard deviations, that falls by less moves nothing by a tenth of one.
+CONVERGED_COST = 0.01
+# A round is a start for the next one: it ends where the cost falls by a smaller share.
+SETTLED_SHARE = 1e-3
 # Nothing that pictures show is nearer.
 MIN_DEPTH_M = 0.1
 # Rays that are nearer to parallel start their point by it where the camera is.
@@ -697,8 +701,10 @@ def _adjusted(start: _Similarity, bundle: _Bundle) -> _AdjustedMap:
                 damping *= 10
             else:
                 break
+            fell = now - cost
             (at, turn, points), now, damping = tried, cost, max(damping / 10, 1e-9)
-            if np.abs(step[:, 3:]).max() < CONVERGED_RAD:
+            least = CONVERGED_COST if loss_px == LOSS_ROUNDS_PX[-1] else SETTLED_SHARE * now
+            if np.abs(step[:, 3:]).max() < CONVERGED_RAD or fell < least:
                 break
         else:
             raise NoAttitudesError("no attitudes fit its map and its places: the adjustment did not converge")
