@@ -17,7 +17,7 @@ from pipelines.export import export
 from pipelines.ingest import ingest
 from pipelines.planning.scene import ReplanSettings
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.replan import replan
+from pipelines.replan import replan as replan_compare
 from pipelines.report import report
 from pipelines.run import run
 from pipelines.session.errors import DataError
@@ -39,7 +39,7 @@ __all__ = [
     "ingest",
     "read_flight",
     "reconstruct",
-    "replan",
+    "replan_compare",
     "report",
     "run",
     "simulate",

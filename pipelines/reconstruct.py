@@ -181,7 +181,7 @@ class Reconstructed:
 
 def reconstruct(
     folder: Path,
-    settings: ReconstructSettings | None = None,
+    settings: ReconstructSettings = ReconstructSettings(),
     *,
     workers: int = 1,
     executor: Executor | None = None,
@@ -196,7 +196,6 @@ def reconstruct(
     DataError: the session cannot be used, one of its tables or the pictures were changed, or nothing could be
     reconstructed (with the counts of the reasons). BusyError: another process writes the session.
     """
-    settings = settings or ReconstructSettings()
     progress = progress or Silent()
     disturbance = PoseDisturbance.parse(settings.disturb_poses) if settings.disturb_poses else None
     smoother(settings.smooth)

@@ -100,7 +100,7 @@ def settings_of(stated: Sequence[str], **others: Any) -> ReplanSettings:
 
 def replan(
     folder: Path,
-    settings: ReplanSettings | None = None,
+    settings: ReplanSettings = ReplanSettings(),  # noqa: B008  # it is frozen
     *,
     name: str | None = None,
     force: bool = False,
@@ -112,7 +112,6 @@ def replan(
     DataError: the session cannot be used (it has no positions of the actor, or a table was changed), or a
     setting is wrong. BusyError: another process writes the session.
     """
-    settings = settings or ReplanSettings()
     progress = progress or Silent()
     return_freed_arrays()
     refuse_unknown(settings.arms or ())

@@ -74,6 +74,9 @@ def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[s
     DataError: the folder holds no flight, or something is missing that only the user knows.
     """
     manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
+    if folder.is_file() and manifest != folder:
+        problem = "is no folder and no flight.yaml"
+        raise DataError(folder, problem, "name the folder that holds the flight's files", code="wrong-kind")
     if not must_be_drafted(manifest):
         return manifest, []
     open_keys: set[str] = set()

@@ -352,7 +352,11 @@ class _ManifestWriter:
             remark = what if camera.focal_by_film else self.assume(camera, "intrinsics", what)
             return DraftedKey(guess, [remark], self.others("intrinsics", self.draft.free_intrinsics))
         if choice is None:
-            free = "nothing of that name has them" if self.draft.free_intrinsics else "no other file has them"
+            free = (
+                "no name tells which of those below"
+                if self.draft.free_intrinsics
+                else "no other file has them"
+            )
             remark = self.miss(camera, "intrinsics", free)
             numbers = {"width": 1920, "height": 1080, "fx": 1400, "fy": 1400, "cx": 959.5, "cy": 539.5}
             others = self.others("intrinsics", self.draft.free_intrinsics)

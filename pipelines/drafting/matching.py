@@ -446,12 +446,16 @@ def _ask_for_the_rest(
     film, taken = camera.film, [c.choices["pose"].taken for c in cameras if "pose" in c.choices]
     free = [c for c in moving if c not in taken and (film is None or _may_be_of(film, c))]
     for key, candidates in (("pose", free), ("intrinsics", intrinsics)):
-        listed = sorted(
-            candidates, key=lambda each: (-camera.likely.get(id(each), 0.0), each.rank, each.place)
-        )
+        used = [c.choices[key].taken for c in cameras if key in c.choices]
+
+        def unlikely(each: Proposal, used: Sequence[Proposal] = used) -> tuple[object, ...]:
+            return each in used, -camera.likely.get(id(each), 0.0), each.rank, each.place
+
+        listed = sorted(candidates, key=unlikely)
         if key in camera.choices or not listed:
             continue
-        options = tuple(f"{' '.join(filter(None, (c.path.name, c.topic)))} ({c.about})" for c in listed)
+        titles = [(c.path.name, c.topic or str(c.settings.get("camera", "")), f"({c.about})") for c in listed]
+        options = tuple(" ".join(filter(None, each)) for each in titles)
         if (answer := ask(Question((camera.name,), key, options))) is not None:
             others = tuple(c for k, c in enumerate(listed) if k != answer.option)
             why = "for nothing else is as likely"

@@ -28,6 +28,7 @@ from pipelines.geometry.arrays import RelativeTo
 from pipelines.geometry.mounting import Looks
 from pipelines.session.errors import DataError
 from pipelines.session.registries import (
+    FORMATS,
     CalibrationFormat,
     Format,
     KeypointFormat,
@@ -722,6 +723,12 @@ def _assumed_in(mapping: Mapping[str, Any], place: str) -> Iterator[str]:
 
 def read_flight(path: Path) -> Manifest:
     """Read and validate a manifest; one DataError holds every problem that was found."""
+    others = []
+    if path.suffix.lower() not in {".yaml", ".yml"} and path.exists():
+        others = [format_.title for format_ in FORMATS.all() if format_.recognises(path)]
+    if path.is_dir() or others:
+        problem = f"is no flight manifest but {' or '.join(others) or 'a folder'}"
+        raise DataError(path, problem, "`mocap run FOLDER` drafts one and runs its flight", code="wrong-kind")
     flight = read_yaml_model(
         path,
         Manifest,

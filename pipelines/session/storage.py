@@ -129,7 +129,8 @@ def read_text(path: Path, *, most_bytes: int | None = None) -> str:
         raise as_data_error(error, path) from error
     except UnicodeDecodeError as error:
         problem = f"is not UTF-8 text (byte {error.start})"
-        raise DataError(path, problem, "save it as UTF-8", code="damaged") from error
+        remedy = "name a text file here, or save it as UTF-8"
+        raise DataError(path, problem, remedy, code="damaged") from error
 
 
 def sha256_of(path: Path) -> str:
