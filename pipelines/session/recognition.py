@@ -63,7 +63,7 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
         return matches[0]
     if not matches:
         likely = [f for f in candidates if path.suffix and path.suffix.lower() in f.suffixes]
-        if len(likely) == 1 and path.is_file():
+        if len(likely) == 1 and path.is_file() and not any(f.recognises(path) for f in FORMATS.all()):
             return likely[0]  # its reader says exactly what is wrong
         raise _unrecognised(path, noun, sorted(f.name for f in candidates))
     problem = f"could be {' or '.join(sorted(f.name for f in matches))}"
