@@ -92,6 +92,7 @@ _SHORT_OF_MEMORY = (
 MIN_ADDRESS_SPACE_BYTES = 700 << 20
 # These commands load more of such libraries.
 LARGE_COMMANDS = {"run", "reconstruct", "replan-compare", "report", "batch"}
+# With less, OpenBLAS or COLMAP ended them in one run of three.
 MIN_ADDRESS_SPACE_OF_LARGE_BYTES = 2000 << 20
 
 

@@ -163,3 +163,14 @@ def test_right_logs_stay_as_they_are(
     order = np.argsort(receive_s[kept], kind="stable")
     header, receive = in_ns(t_s * (1 + drift) + offset_s)[kept][order], in_ns(receive_s)[kept][order]
     assert find_steps(header, receive) == []
+
+
+@pytest.mark.parametrize("step_s", [-0.25, 0.1, 0.35])
+def test_a_step_behind_a_slow_link_is_found_to_the_ms(step_s: float) -> None:
+    """Queued messages arrive up to 0.1 s late; the header's own intervals are even."""
+    sent_ns = np.arange(1200) * 10_000_000
+    delay_ns = np.random.default_rng(0).exponential(20e6, 1200).astype(np.int64)
+    header_ns = sent_ns + 1 + (np.arange(1200) >= 700) * round(step_s * 1e9)
+    [step] = find_steps(header_ns, np.maximum.accumulate(sent_ns + delay_ns))
+    assert step.index == 700
+    assert abs(step.step_s - step_s) < 1e-3
