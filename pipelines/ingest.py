@@ -40,7 +40,7 @@ from pipelines.session.maps import store_map
 from pipelines.session.people import joint_called
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import recognise
-from pipelines.session.records import JointMotion, Occupancy, Trajectory
+from pipelines.session.records import JointMotion, Occupancy, Topic, Trajectory
 from pipelines.session.registries import MapFormat
 from pipelines.session.stages import Stage, StageRecord, locked, note_sources, usable_record
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
@@ -558,29 +558,33 @@ class _FlightReader:
             raise DataError(f"{self._flight_path}: map.file {log}", problem, remedy, code="no-overlap")
 
     def unused_gimbals(self) -> list[Doubt]:
-        """Doubt cameras that are fixed to a body whose log holds the angles of a gimbal that nobody names."""
+        """Doubt cameras that are fixed to a body where a log holds angles of a gimbal that nobody names."""
         cameras = self._flight.cameras
         used = {camera.gimbal.topic for camera in cameras.values() if camera.gimbal is not None}
-        doubts = []
+        found: dict[str, tuple[str, Topic]] = {}
         for name, camera in cameras.items():
-            log = camera.pose.file
-            if camera.gimbal or camera.mount is None or not self._files.is_log("pose", camera.pose):
+            if camera.gimbal or camera.mount is None:
                 continue
-            with self._logs.open(log) as opened:
-                angles = [topic.name for topic in opened.recording.topics if kind_of(topic) == "angles"]
-            free = [topic for topic in angles if topic not in used and is_called(topic, GIMBAL)]
-            own = [topic for topic in free if name in topic] or (free if len(free) == 1 else [])
-            if own:
-                doubts.append(
-                    Doubt(
-                        code="unused",
-                        cameras=[name],
-                        what=f"the log of {name} holds the angles of a gimbal, {own[0]}, that nothing uses",
-                        evidence={},
-                        remedy=f"cameras.{name}.gimbal: {{file: {log}, topic: {own[0]}, relative_to: world}}",
-                    )
-                )
-        return doubts
+            own = [camera.pose.file] if self._files.is_log("pose", camera.pose) else []
+            for log in dict.fromkeys([*own, *self._flight.logs]):
+                with self._logs.open(log) as opened:
+                    topics = [topic for topic in opened.recording.topics if _is_of_gimbal(topic)]
+                free = [topic for topic in topics if topic.name not in used]
+                mine = [topic for topic in free if name in topic.name] or (free if len(free) == 1 else [])
+                if mine and name not in found:
+                    found[name] = (log, max(mine, key=lambda topic: kind_of(topic) == "angles"))
+        if not found:
+            return []
+        names = ", ".join(topic.name for _, topic in found.values())
+        unread = sorted({topic.type for _, topic in found.values() if kind_of(topic) != "angles"})
+        hint = f" ({', '.join(unread)} is not read: write it as QuaternionStamped)" if unread else ""
+        lines = (
+            f"cameras.{name}.gimbal: {{file: {log}, topic: {topic.name}, relative_to: world}}"
+            for name, (log, topic) in found.items()
+        )
+        what = f"logs hold the angles of a gimbal that nothing uses: {names}{hint}"
+        remedy = "" if unread else "; ".join(lines)
+        return [Doubt(code="unused", cameras=list(found), what=what, evidence={}, remedy=remedy)]
 
     def _near_origin(self, source: Path, maps: Iterable[Occupancy]) -> Iterator[Occupancy]:
         """Yield maps in the world; errors as in `FlightPoses.map`."""
@@ -590,6 +594,14 @@ class _FlightReader:
             high = placed.origin + np.array(placed.probability.shape) * placed.resolution_m
             self.map_box = self.map_box or (placed.origin, high)
             yield placed
+
+
+def _is_of_gimbal(topic: Topic) -> bool:
+    """Test by its name if a topic holds the angles of a gimbal, of a type that is read or not."""
+    kind = kind_of(topic)
+    return kind in ("angles", None) and is_called(
+        topic.name, GIMBAL if kind else frozenset({"gimbal", "ptz"})
+    )
 
 
 def _refuse_unsound(flight_path: Path, description: Description) -> None:

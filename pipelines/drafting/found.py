@@ -176,7 +176,7 @@ ACTOR = frozenset(
 NO_PICTURES = frozenset({"depth", "disparity", "infra", "mask", "segmentation", "confidence"})
 OPTICAL = frozenset({"camera", "cam", "optical", "lens"})
 BODIES = frozenset({"base", "body", "imu", "fcu"})
-GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
+GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "pantilt", "ptz", "payload", "camera", "cam"})
 NED = frozenset({"ned", "px4", "fmu"})
 
 

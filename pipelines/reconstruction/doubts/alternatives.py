@@ -23,7 +23,9 @@ from pipelines.geometry.poses import (
 )
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import (
+    FEW,
     JOINTS,
+    PLACED_M,
     STATURE_M,
     Body,
     Sampled,
@@ -31,7 +33,6 @@ from pipelines.reconstruction.doubts.scene import (
     scene_of,
     trunk_direction,
 )
-from pipelines.reconstruction.doubts.score import FEW, PLACED_M, solve
 from pipelines.reconstruction.observations import Filmed
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
@@ -274,7 +275,7 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     )
 
 
-def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]:
+def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterator[Alternative]:
     """Scale all positions so that the person has a usual stature: rays that fit go on fitting.
 
     What else is placed in the world, as a map or an actor, is scaled with them, or is right as it is. The
@@ -284,7 +285,7 @@ def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]
     # Any scale makes the person as tall as people are: that much surer the stature makes it (see `_freedom`).
     price = PRICE_OF_ALL + np.log(1 / STATURE_SHARE) / 2 + dearer
     size = STATURE_M / stature
-    by_actor, sigma = _scaled_to_actor(trial, size)
+    by_actor, sigma = _scaled_to_actor(trial, joints, size)
     unit = next((name for name, m in _UNITS_M.items() if abs(np.log(by_actor / m)) < STATURE_SHARE), None)
     alone = unit is not None
     if flight.truth_m is not None:
@@ -307,11 +308,11 @@ def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]
         yield Alternative(code, trial.names, what, remedy, cost, scene, True, evidence, flight=placed)
 
 
-def _scaled_to_actor(trial: Trial, size: float) -> tuple[float, float]:
+def _scaled_to_actor(trial: Trial, joints: Float, size: float) -> tuple[float, float]:
     """Return the factor of all positions that the stature and a logged actor show, and its relative error."""
     if trial.flight.hips is None:
         return size, STATURE_SHARE
-    hips = Body(solve(trial.described).joints).hips
+    hips = Body(joints).hips
     known = np.isfinite(hips + trial.flight.hips).all(axis=1)
     far2 = float((hips[known] ** 2).sum())
     factor = float((hips * trial.flight.hips)[known].sum()) / max(far2, 1e-9)

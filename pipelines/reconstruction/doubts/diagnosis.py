@@ -147,7 +147,10 @@ def doubts_of(
     if flight is not None and truth is not None:
         size_m = stature_m(truth.position[:, 0])
         flight = flight._replace(truth_m=size_m if np.isfinite(size_m) else None)
-    return diagnose(flight, late)
+    found = diagnose(flight, late)
+    # A gimbal that nothing uses explains more than any other change would.
+    unused = [doubt for doubt in description.doubts if doubt.code == "unused" and found]
+    return [*unused, *(doubt for doubt in found if not unused or not doubt.remedy)]
 
 
 def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, float | str]]) -> list[Doubt]:
@@ -211,7 +214,10 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
     if "size" in found.odd and (odd or objective.described.strain >= STRAINED):
         dearer = 0.0 if found.odd["size"].sigmas >= STRANGE_SIZE else MARGIN
-        tried += map(objective.scored, alternatives.scales(trial, found.stature_m, dearer))
+        tried += map(
+            objective.scored,
+            alternatives.scales(trial, solve(trial.described).joints, found.stature_m, dearer),
+        )
     # Times come last, since most of them need no exact score beside what fits by then.
     tried += map(objective.scored, alternatives.rates(trial))
     tried += [objective.best_clock([index]) for index in trial.every]

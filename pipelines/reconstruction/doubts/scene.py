@@ -39,6 +39,10 @@ MOMENTS = 60
 STEP_NS = 100_000_000
 """Between the two moments of a pair, for speeds."""
 
+# The logged hips of an actor err by this much.
+PLACED_M = 0.3
+# Errors of a logged actor wander, and count as so many independent ones.
+FEW = 3
 _CALIBRATED = (0.003, 0.001, 0.0, 0.0, 0.0, 0.0)  # of a still camera
 # A keypoint is interpolated over at most this time between two pictures.
 _LONGEST_GAP_NS = 250_000_000

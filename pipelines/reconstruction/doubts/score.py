@@ -20,7 +20,9 @@ from pipelines.geometry.arrays import Bool, Float, Int64, known_median
 from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.reconstruction.doubts.scene import (
+    FEW,
     JOINTS,
+    PLACED_M,
     Body,
     Oddity,
     Sampled,
@@ -48,12 +50,8 @@ _CONVERGED = 0.05
 _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
 # Derivatives are taken over this step of m, rad and logarithms.
 _PROBE = 1e-4
-# The logged hips of an actor err by this much.
-PLACED_M = 0.3
 # Residuals beyond this many standard deviations count linearly.
 _HUBER = 1.5
-# Errors of a logged actor wander, and count as so many independent ones.
-FEW = 3
 # A person is filmed from about this distance where none is known.
 _USUAL_M = 10.0
 # With fewer rays nothing can be fitted.
