@@ -117,18 +117,25 @@ def _is_short_of_memory(error: BaseException) -> bool:
     return error.__cause__ is not None and _is_short_of_memory(error.__cause__)
 
 
+# A refusal that is longer, without its file, goes on with a line for each of its parts.
+MAX_LINE_CHARACTERS = 140
+
+
 def print_error(error: MocapError) -> None:
-    """Print an error as one line on stderr, and lines of flight.yaml that mend it each on its own below."""
-    remedy = error.remedy if isinstance(error, DataError) else ""
-    changes = remedy.split("; ")
-    if not any(change.removeprefix("set ").startswith(("cameras.", "world.")) for change in changes):
-        say(f"mocap: {one_line(str(error))}", err=True)
-        return
-    say(f"mocap: {one_line(str(error).removesuffix(f'; {remedy}'))}", err=True)
+    """Print an error as one line on stderr; what makes it long, and lines of flight.yaml, come below it."""
     from pipelines.session.description import as_instruction
 
-    for change in changes:
-        say(f"  {one_line(as_instruction(change))}", err=True)
+    remedy = error.remedy if isinstance(error, DataError) else ""
+    changes = [as_instruction(change) for change in remedy.split("; ")]
+    parts = [str(error)]
+    source = str(error.source) if isinstance(error, DataError) else ""
+    if len(parts[0]) - len(source) > MAX_LINE_CHARACTERS or changes[0].startswith(
+        ("set cameras.", "set world.")
+    ):
+        problems = parts[0].removesuffix(f"; {remedy}") if remedy else parts[0]
+        parts = [*problems.split("; "), *(changes if remedy else [])]
+    for number, part in enumerate(parts):
+        say(f"  {one_line(part)}" if number else f"mocap: {one_line(part)}", err=True)
 
 
 class _Lazy(Mocap):

@@ -563,16 +563,15 @@ class _FlightReader:
         used = {camera.gimbal.topic for camera in cameras.values() if camera.gimbal is not None}
         found: dict[str, tuple[str, Topic]] = {}
         for name, camera in cameras.items():
-            if camera.gimbal or camera.mount is None:
+            log = camera.pose.file
+            if camera.gimbal or camera.mount is None or not self._files.is_log("pose", camera.pose):
                 continue
-            own = [camera.pose.file] if self._files.is_log("pose", camera.pose) else []
-            for log in dict.fromkeys([*own, *self._flight.logs]):
-                with self._logs.open(log) as opened:
-                    topics = [topic for topic in opened.recording.topics if _is_of_gimbal(topic)]
-                free = [topic for topic in topics if topic.name not in used]
-                mine = [topic for topic in free if name in topic.name] or (free if len(free) == 1 else [])
-                if mine and name not in found:
-                    found[name] = (log, max(mine, key=lambda topic: kind_of(topic) == "angles"))
+            with self._logs.open(log) as opened:
+                topics = [topic for topic in opened.recording.topics if _is_of_gimbal(topic)]
+            free = [topic for topic in topics if topic.name not in used]
+            own = [topic for topic in free if name in topic.name] or (free if len(free) == 1 else [])
+            if own:
+                found[name] = (log, max(own, key=lambda topic: kind_of(topic) == "angles"))
         if not found:
             return []
         names = ", ".join(topic.name for _, topic in found.values())

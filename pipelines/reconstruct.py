@@ -370,12 +370,13 @@ def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> 
         return
     codes, counts = np.unique(status, return_counts=True)
     gates = ", ".join(f"{STATUS[code]} {count}" for code, count in zip(codes, counts, strict=True))
-    reasons = [*attempt.association.reasons, *(doubt.what for doubt in doubts[:1] if doubt.remedy)]
-    remedies = [doubt.remedy for doubt in doubts[:1] if doubt.remedy]
+    cause = next((doubt for doubt in doubts[:1] if doubt.remedy), None)
+    why = [cause.what] if cause else [f"{gates}, {noise_text(attempt.views)}", *attempt.association.reasons]
+    advice = "check calibration, clocks and poses, or state another pose noise with --pose-noise"
     raise DataError(
         folder,
-        "; ".join([f"no joint could be reconstructed ({gates}; {noise_text(attempt.views)})", *reasons]),
-        *(remedies or ["check calibration, clocks and poses, or state another pose noise with --pose-noise"]),
+        "; ".join(["no joint could be reconstructed", *why]),
+        cause.remedy if cause else advice,
         code="nothing-reconstructed",
     )
 

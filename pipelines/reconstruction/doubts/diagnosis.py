@@ -258,6 +258,11 @@ class Tried(NamedTuple):
         """The score with the price; what is seen directly, without a scene, wins over everything."""
         return -np.inf if self.score is None else self.score.total + self.alternative.price
 
+    @property
+    def is_clock_of_one(self) -> bool:
+        """Test for another clock of one camera, which the rays alone may tell."""
+        return self.alternative.code == "clock" and not self.alternative.alike
+
 
 class Compared(NamedTuple):
     """The two parts of the objective, of the description and of an alternative with its price."""
@@ -412,7 +417,9 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tri
     most = objective.base.total + surprise(unposed(objective.trial.described)) - LEAST_GAIN_OF_TIMES
     by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=without_rays)
     by_score = [
-        each for each in by_score[:_FITTED] if not each.alternative.alike or without_rays(each) <= most
+        each
+        for each in by_score[:_FITTED]
+        if each.alternative.code not in TIMES or each.is_clock_of_one or without_rays(each) <= most
     ]
     weighed = []
     for each in [*by_score, *(each for each in tried if np.isfinite(each.cost))]:
