@@ -674,4 +674,7 @@ def _share_interval(count: int, of: int) -> str:
 
 
 def _named(row: dict[str, Any]) -> str:
-    return f"{row['arm']} from {row['range_m']:g} m at {row['tilt_deg']:g} deg with {row['robots']} drones"
+    usual = (*_MEASURED, "arm", "actor", "range_m", "tilt_deg", "robots", "best", "tradeoff")
+    others = "".join(f", {name}={value}" for name, value in row.items() if name not in usual)
+    place = f"from {row['range_m']:g} m at {row['tilt_deg']:g} deg"
+    return f"{row['arm']} {place} with {row['robots']} drones{others}"
