@@ -573,6 +573,10 @@ KALIBR = CalibrationFile(
 
 # --- AirSim's settings.json: cameras by field of view -------------------------------------------------------
 
+# No lens of a drone has a smaller field of view.
+_LEAST_FOV_DEG = 0.1
+# Sensors have fewer columns.
+_MOST_COLUMNS = 100_000
 # What the simulator takes where nothing is stated (its documentation of settings).
 _AIRSIM_PICTURE = {"Width": 256, "Height": 144, "FOV_Degrees": 90}
 
@@ -612,8 +616,9 @@ def _airsim_camera(
 ) -> CalibratedCamera:
     stated = {**_AIRSIM_PICTURE, **defaults, **_scene_of_airsim(path, block)}
     width, height, fov_deg = numbers(path, name, [stated[key] for key in _AIRSIM_PICTURE])
-    if not 0 < fov_deg < 180:
-        raise bad_value(path, f"camera {name} has a field of view of {fov_deg:g} deg")
+    if not (_LEAST_FOV_DEG <= fov_deg < 180 and 0 < width <= _MOST_COLUMNS):
+        problem = f"camera {name} has a field of view of {fov_deg:g} deg over {width:g} px"
+        raise bad_value(path, problem)
     focal_px = width / 2 / np.tan(np.radians(fov_deg) / 2)
     matrix = _matrix_of(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     lens = intrinsics(path, name, size=[width, height], matrix=matrix, distortion=[], fisheye=False)

@@ -91,7 +91,10 @@ def numbers(source: Path, name: str, value: object) -> Float:
         isinstance(cell, int | float) and not isinstance(cell, bool) for cell in value
     ):
         raise bad_value(source, f"{name} is no list of numbers")
-    return np.array(value, dtype=np.float64)
+    try:
+        return np.array(value, dtype=np.float64)
+    except OverflowError as error:
+        raise bad_value(source, f"{name} has a number of too many digits") from error
 
 
 def leads_out(stated: str) -> bool:
