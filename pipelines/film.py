@@ -19,7 +19,6 @@ from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.triangulation import Views
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.comparison import common_frames, figures_of, filmed_verdict, judge
@@ -48,7 +47,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=7)
+FILM = Stage("film", revision=8)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -165,7 +164,6 @@ def film(
         )
         metrics: dict[str, dict[str, Any]] = {}
         errors: dict[str, MeasuredJoints] = {}
-        desired_deg = float(compared.settings["planner.tilt_deg"])
         for name, arm in arms.items():
             parts = [
                 run.chunk(f"{name}-{camera}", partial(_film_camera, arm, k, renderer, detector, progress))
@@ -174,8 +172,7 @@ def film(
             sightings = _read_sightings(parts)
             seed = compared.settings["seed"]  # one draw of the comparison's pose noise
             measured = [
-                _measured(arm, of, seen, seed=seed, desired_tilt_deg=desired_deg)
-                for of, seen in zip(arm.people, sightings, strict=True)
+                _measured(arm, of, seen, seed=seed) for of, seen in zip(arm.people, sightings, strict=True)
             ]
             points = np.stack([own for own, _, _ in measured], axis=1)
             errors[name] = joined([of_draws for _, of_draws, _ in measured])
@@ -367,29 +364,27 @@ def _read_sightings(parts: Sequence[Path]) -> list[SimulatedKeypoints]:
 
 
 def _measured(
-    arm: _Arm, of: Walk, sightings: SimulatedKeypoints, *, seed: int, desired_tilt_deg: float
+    arm: _Arm, of: Walk, sightings: SimulatedKeypoints, *, seed: int
 ) -> tuple[Float, MeasuredJoints, dict[str, Any]]:
     """Reconstruct a person [T, J, 3], with errors in several draws, and measure the arm by them."""
     elapsed_s = (of.t_ns - of.t_ns[0]) / 1e9
 
-    def reconstructed(draw: int) -> tuple[Views, Float, str | None]:
+    def reconstructed(draw: int) -> tuple[Float, str | None]:
         views = views_of(of, arm.seen_by, sightings, arm.noise, seed=seed, trial=draw)
-        views, found, doubt = refined_points(views, elapsed_s, of.person.joints, arm.noise)
-        return views, found.reshape(of.joints.shape), doubt
+        _, found, doubt = refined_points(views, elapsed_s, of.person.joints, arm.noise)
+        return found.reshape(of.joints.shape), doubt
 
-    views, points, doubt = reconstructed(0)
-    each = [points, *(reconstructed(draw)[1] for draw in range(1, DRAWS))]
+    points, doubt = reconstructed(0)
+    each = [points, *(reconstructed(draw)[0] for draw in range(1, DRAWS))]
     off_m = np.linalg.norm(np.stack(each) - of.joints, axis=-1).astype(np.float32)
     slots = slot_of(arm.seen_by.position - of.motion.root)
     figures = measure_arm(
         of,
         arm.seen_by,
         sightings,
-        views,
         points,
         tilt_deg=np.degrees(slots[..., TILT] if arm.tilt_rad is None else arm.tilt_rad),
         range_m=slots[..., 2],
-        desired_tilt_deg=desired_tilt_deg,
     )
     known = int(np.isfinite(of.joints[..., 0]).sum())
     return points, MeasuredJoints(off_m, known), figures | {"fallback": doubt}

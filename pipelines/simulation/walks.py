@@ -23,7 +23,6 @@ from pipelines.geometry.triangulation import (
     Method,
     Views,
     estimate_noise,
-    reprojection_px,
     triangulate_pictures,
 )
 from pipelines.session.camera_poses import parsed_noise_models
@@ -228,8 +227,6 @@ def views_of(
 NEAR_SHARE = 0.1
 """Largest error of a right keypoint, as a share of the height in pixels of a person at that place."""
 
-# A tilt within this of the wanted one counts as kept.
-_NEAR_TILT_DEG = 5.0
 _ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
 
 
@@ -244,17 +241,15 @@ def measure_arm(
     of: Walk,
     seen_by: CameraFormation,
     sightings: SimulatedKeypoints,
-    views: Views,
     points: Float,
     *,
     tilt_deg: Float,
     range_m: Float,
-    desired_tilt_deg: float,
 ) -> dict[str, Any]:
     """Measure an arm: figures by their names in film/metrics.json.
 
-    Shares are of pictures, of joints in them, or of moments. `views` has one row for each joint-frame of
-    `points` [T, J, 3] m, NaN where there is none; tilts and ranges [N, T] are the cameras' from the person.
+    Shares are of pictures, or of joints in them. Points are [T, J, 3] m, NaN where there is none; tilts and
+    ranges [N, T] are the cameras' from the person.
     """
     exact = exact_keypoints(of, seen_by).xy
     inside = np.isfinite(exact[..., 0])
@@ -268,20 +263,12 @@ def measure_arm(
         "tilt_deg": {
             "mean": float(tilt_deg.mean()),
             "max": float(tilt_deg.max()),
-            "within_5_share": float((np.abs(tilt_deg - desired_tilt_deg) <= _NEAR_TILT_DEG).mean()),
         },
         "detected_share": float((sightings.confidence > 0).any(axis=-1).mean()),
         "keypoint_pck": float(near[inside].mean()) if inside.any() else None,
         "keypoint_median_px": float(np.median(measured)) if measured.size else None,
-        "reprojection_px": _reprojection_px(views, points),
         **{name: errors[name] for name in _ERRORS},
     }
-
-
-def _reprojection_px(views: Views, points: Float) -> dict[str, float] | None:
-    off_px = reprojection_px(views, points.reshape(-1, 3))
-    used = off_px[np.isfinite(off_px)]
-    return {"mean": float(used.mean()), "median": float(np.median(used))} if used.size else None
 
 
 # --- settings of a study -------------------------------------------------------------------------------
