@@ -49,7 +49,9 @@ def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Fl
     middle = {name: np.median(track.position, axis=0) for name, track in cameras.items()}
     doubts = []
     all_far = [_apart_m(*two) for two in combinations(middle.values(), 2)]
-    if all_far and _ONE_FLIGHT_M < min(all_far) <= max(all_far) < _TEAM_M / _UNITS_M["mm"]:
+    # Of two drones, one alone may be in another unit or place; still cameras come from one calibration.
+    tells = len(middle) > 2 or all(len(track.t_ns) == 1 for track in cameras.values())
+    if tells and all_far and _ONE_FLIGHT_M < min(all_far) <= max(all_far) < _TEAM_M / _UNITS_M["mm"]:
         doubts.append(
             Doubt(
                 code="unit",
