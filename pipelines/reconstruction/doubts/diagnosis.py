@@ -260,7 +260,7 @@ class Tried(NamedTuple):
 
     @property
     def is_clock_of_one(self) -> bool:
-        """Test for another clock of one camera, which the rays alone may tell."""
+        """Test for another clock of one camera."""
         return self.alternative.code == "clock" and not self.alternative.alike
 
 
@@ -416,10 +416,12 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tri
 
     most = objective.base.total + surprise(unposed(objective.trial.described)) - LEAST_GAIN_OF_TIMES
     by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=without_rays)
+    # The rays alone may tell the clock of one camera, where the score pays its price.
     by_score = [
         each
         for each in by_score[:_FITTED]
-        if each.alternative.code not in TIMES or each.is_clock_of_one or without_rays(each) <= most
+        if each.alternative.code not in TIMES
+        or without_rays(each) <= most + LEAST_GAIN_OF_TIMES * each.is_clock_of_one
     ]
     weighed = []
     for each in [*by_score, *(each for each in tried if np.isfinite(each.cost))]:
