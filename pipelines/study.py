@@ -91,9 +91,10 @@ from pipelines.simulation.walks import (
 )
 
 # It is raised whenever the same study gives other figures than before.
-_REVISION = 8
+_REVISION = 9
 # A study with more combinations would take days.
 _MAX_CELLS = 500
+_COMMA = r",(?![^\[]*\])"  # not between brackets
 _RANGE = re.compile(r"(-?[0-9.]+):(-?[0-9.]+):([0-9.]+)")
 _MEASURED = (
     *("capped_mm", "mpjpe_mm", "pck150", "coverage", "mean_range_m", "mean_tilt_deg", "hidden_share"),
@@ -141,7 +142,7 @@ def values_of(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
             values = (text,)
         else:
             models = name.endswith("noise") and ":" in text
-            values = tuple(part.strip() for part in text.split(";" if models else ","))
+            values = tuple(part.strip() for part in re.split(";" if models else _COMMA, text))
         if not values or not all(values):
             raise DataError(word, "states no value", "write 2,3,4 or 0:60:15", code="bad-value")
         stated[name] = values
@@ -178,7 +179,8 @@ def study(
 
 
 def _joined(values: Sequence[str]) -> str:
-    return (";" if any("," in value for value in values) and len(values) > 1 else ",").join(values)
+    has_commas = any(re.search(_COMMA, value) for value in values)
+    return (";" if has_commas and len(values) > 1 else ",").join(values)
 
 
 Produce = Callable[[Making], tuple[dict[str, Any], Sequence[Row]]]
@@ -398,6 +400,9 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
                 capped = [np.array([capped[k].mean() for k in own]) for own in groups]
             best = _mark_tradeoff(rows, capped)
             if len(walks) > 1:
+                for row, group in zip(rows, groups, strict=True):
+                    for k in group:
+                        every[k] |= {"best": row["best"], "tradeoff": row["tradeoff"]}
                 by_walk = [[places[k] for k in own] for own in groups]
                 best["walks"] = [_count_walks(by_walk[best["cell"]], own) for own in by_walk]
             metrics = {
@@ -483,11 +488,12 @@ def _by_combination(rows: Sequence[Row]) -> list[list[int]]:
 
 
 def _over_walks(rows: Sequence[Row]) -> Row:
-    """Average the rows of one combination over the walks; the interval of the error is over them, too."""
+    """Average the rows of one combination over the walks, but take the least of distances."""
     row = {name: value for name, value in rows[0].items() if name != "actor"}
     for name in _MEASURED:
         known = [one[name] for one in rows if one[name] is not None]
-        row[name] = float(np.mean(known)) if known else None
+        over = np.min if name.startswith("min_") else np.mean
+        row[name] = float(over(known)) if known else None
     found = mean_of_trials(np.array([one["capped_mm"] for one in rows]))
     row["low_mm"], row["high_mm"] = (found and found["interval"]) or (None, None)
     row["violations"] = sum(one["violations"] for one in rows)
@@ -651,13 +657,16 @@ def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
         f" {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
     ]
     if best["alike"]:
-        words.append(f"No difference worth flying to {'; '.join(_named(rows[k]) for k in best['alike'])}")
+        start = "On average no" if "walks" in best else "No"
+        words.append(
+            f"{start} difference worth flying to {'; '.join(_named(rows[k]) for k in best['alike'])}"
+        )
     for k, counts in enumerate(best.get("walks", ())):
         if k != best["cell"]:
             share = _share_interval(counts["better"], counts["walks"])
             words.append(
                 f"It is better than {_named(rows[k])} in {counts['better']} of {counts['walks']} walks"
-                f" ({share}), worse in {counts['worse']}"
+                f" (95 % interval: {share}), worse in {counts['worse']}"
             )
     least = min((row for row in rows if row["tradeoff"]), key=lambda row: float(row["path_m"]))
     if least is not own:

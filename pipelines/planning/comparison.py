@@ -299,9 +299,9 @@ def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]
 
 
 def told_apart(found: MeanWithInterval) -> bool:
-    """Test if an interval over trials excludes zero; without an interval any difference counts."""
+    """Test if an interval excludes zero; without an interval no difference counts."""
     ends = found["interval"]
-    return bool(found["mean"]) and (ends is None or not ends[0] <= 0.0 <= ends[1])
+    return ends is not None and not ends[0] <= 0.0 <= ends[1]
 
 
 def judge(
@@ -340,12 +340,13 @@ def judge(
 def outcome(best: Mapping[str, Any]) -> str:
     """Say which arm is better, that none is, or that the figures disagree."""
     arm, other = best["difference"]["arm"], best["difference"]["against"]
+    worse = " and ".join(sorted(best["worse"]))
     if best["disagree"]:
         return f"the figures disagree: {arm} has more joints right, {other} is more accurate"
     if len(best["arms"]) == 1:
-        return f"{arm} is better than {' and '.join(best['worse'])}"
-    worse = f", and both better than {' and '.join(best['worse'])}" if best["worse"] else ""
-    return f"no difference worth flying ({WORTH}) between {' and '.join(best['arms'])}{worse}"
+        return f"{arm} is better than {worse}"
+    rest = f", at least one of them better than {worse}" if worse else ""
+    return f"no difference worth flying ({WORTH}) between {' and '.join(sorted(best['arms']))}{rest}"
 
 
 def verdict(best: Mapping[str, Any] | None, names: Sequence[str]) -> str:
@@ -375,8 +376,8 @@ def _with_interval(found: MeanWithInterval | None, scale: float, unit: str) -> s
     if found is None:
         return f"unknown {unit}"
     ends = found["interval"]
-    interval = f" [{scale * ends[0]:+.1f}, {scale * ends[1]:+.1f}]" if ends else " in a single draw"
-    return f"{scale * found['mean']:+.1f}{interval} {unit}"
+    interval = f"[{scale * ends[0]:+.1f}, {scale * ends[1]:+.1f}]" if ends else "(no interval)"
+    return f"{scale * found['mean']:+.1f} {interval} {unit}"
 
 
 def equal_ranges(range_m: Mapping[str, float]) -> list[list[str]]:

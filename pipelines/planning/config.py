@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from pipelines.session.errors import DataError
 
@@ -16,6 +16,14 @@ MOST_DRONES = 20
 
 Positive = Annotated[float, Field(gt=0, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, strict=True)]
+Speed = Annotated[float, Field(ge=-50, le=50, strict=True)]
+Elevation = Annotated[float, Field(ge=-90, le=90, strict=True)]
+
+
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError("write the lower end first")
+    return ends
 
 
 @dataclass(frozen=True)
@@ -122,14 +130,14 @@ class Imperfections:
     latency_s: Annotated[float, Field(ge=0, le=10, strict=True)] = 0.0
     # For this share of the time drones neither hear where the actor is, nor of new formations.
     outage_share: Annotated[float, Field(ge=0, lt=1, strict=True)] = 0.0
-    # The wind blows to the east and north with these speeds.
-    wind_mps: tuple[float, float] = (0.0, 0.0)
+    # The wind blows to the east and north with these speeds, and costs energy.
+    wind_mps: tuple[Speed, Speed] = (0.0, 0.0)
     # Gusts have this standard deviation along level axes, half of it upwards.
     gust_mps: NotNegative = 0.0
     # Gimbals turn no faster than this.
     gimbal_deg_per_s: Positive | None = None
     # Gimbals reach these elevations of the optical axis.
-    gimbal_pitch_deg: tuple[float, float] = (-90.0, 90.0)
+    gimbal_pitch_deg: Annotated[tuple[Elevation, Elevation], AfterValidator(_ascending)] = (-90.0, 90.0)
     # Drones film until they have used this energy.
     battery_kj: Positive | None = None
 
@@ -226,9 +234,10 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
     of range; every problem in one message.
     """
     problems = []
-    within = {key.removeprefix(_DOTTED): value for key, value in values.items() if key.startswith(_DOTTED)}
-    if within:
-        values = {key: value for key, value in values.items() if not key.startswith(_DOTTED)}
+    dotted = [key for key in values if str(key).startswith(_DOTTED)]
+    if dotted:
+        within = {key.removeprefix(_DOTTED): values[key] for key in dotted}
+        values = {key: value for key, value in values.items() if key not in dotted}
         stated = values.get("imperfections", {})
         values = {**values, "imperfections": {**stated, **within} if isinstance(stated, dict) else stated}
     for key in values:

@@ -218,11 +218,13 @@ def walked_otherwise(flight: LoggedFlight, walk: OtherWalk, maps: Sequence[Occup
     def moved(stamps: Int64, at: Callable[[Int64], Float]) -> tuple[Int64, Float]:
         lasts_ns = (stamps[-1] - first_ns) / walk.speed + walk.delay_s * 1e9
         step_ns = max(int(np.median(np.diff(stamps))), 1)
-        new_ns = np.arange(stamps[0], first_ns + lasts_ns, step_ns).astype(np.int64)
+        new_ns = np.arange(min(stamps[0], first_ns), first_ns + lasts_ns, step_ns).astype(np.int64)
         walked_ns = walk.speed * (new_ns - first_ns)
         stands_ns = when_ns - first_ns
         late_ns = np.clip(walked_ns - stands_ns, 0.0, walk.speed * walk.delay_s * 1e9)
-        old_ns = np.clip(first_ns + walked_ns - late_ns, stamps[0], stamps[-1]).astype(np.int64)
+        old_ns = first_ns + (walked_ns - late_ns).astype(np.int64)
+        there = (old_ns >= stamps[0]) & (old_ns <= stamps[-1])
+        new_ns, old_ns = new_ns[there], old_ns[there]
         place, after = at(old_ns), old_ns > when_ns
         place[after] = middle + (place[after] - middle) @ turn.T
         place[..., 2] += np.interp(old_ns, t_ns, climb_m).reshape(-1, *(1,) * (place.ndim - 2))

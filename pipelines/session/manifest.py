@@ -591,6 +591,8 @@ class MapSource(ProjectedSource, FileSource):
         """Read `{fly: no, see: yes}` as one word; nothing that hides can be flown through."""
         if not isinstance(stated, dict) or set(stated) != {"fly", "see"}:
             return stated
+        if any(each not in (True, False, "yes", "no") for each in stated.values()):
+            return stated
         fly, see = (stated[key] in (True, "yes") for key in ("fly", "see"))
         if fly:
             return "free" if see else stated

@@ -89,7 +89,7 @@ def compared(*arguments: str | Path) -> dict[str, Any]:
 def refused(*arguments: str | Path) -> str:
     done = compare(*arguments)
     assert done.exit_code == 1, (done.exit_code, done.output)
-    (line,) = done.stderr.strip().splitlines()
+    line = " ".join(done.stderr.split())
     assert line.startswith("mocap: ")
     return line
 
