@@ -105,7 +105,8 @@ def _refuse_little_memory() -> None:
         is_large = sys.argv[1:2] and sys.argv[1] in LARGE_COMMANDS
         least = MIN_ADDRESS_SPACE_OF_LARGE_BYTES if is_large else MIN_ADDRESS_SPACE_BYTES
         if limit != resource.RLIM_INFINITY and limit < least:
-            raise OUT_OF_MEMORY
+            problem = f"lets a command have {limit >> 20} MiB of memory, and this one needs {least >> 20} MiB"
+            raise DataError("this machine", problem, "raise the limit (`ulimit -v`)", code="out-of-memory")
 
 
 def _is_short_of_memory(error: BaseException) -> bool:

@@ -656,7 +656,7 @@ def _focal_by_film(film: FoundFilm, found: Proposal, start_ns: int) -> float | N
         return None
     pts_ns = index.pts_ns[index.pts_ns <= WATCHED_NS]
     frames = CameraFrames(np.arange(len(pts_ns)), start_ns + pts_ns - pts_ns[0], pts_ns)
-    focal_px = NOMINAL_FOCAL * film.size[0]
+    focal_px = NOMINAL_FOCAL * max(film.size)
     with suppress(DataError):
         turned = turned_by_pictures(
             str(film.path),

@@ -4,6 +4,7 @@ Doubtful data are counted and reported, unusable data refused with the file at f
 of its own: an interrupted ingest continues with the cameras that it had not finished.
 """
 
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -88,7 +89,7 @@ from pipelines.sources.pictures import open_files
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=11)
+INGEST = Stage("ingest", revision=12)
 
 
 @dataclass(frozen=True)
@@ -595,12 +596,16 @@ class _FlightReader:
             yield placed
 
 
+# Types of messages with angles, or their topics, are called so. Gimbals also have states and switches.
+_ANGLES = re.compile(r"Mount|Joint|Vector3|(?i:angle|attitude|orientation)")
+
+
 def _is_of_gimbal(topic: Topic) -> bool:
     """Test by its name if a topic holds the angles of a gimbal, of a type that is read or not."""
-    kind = kind_of(topic)
-    return kind in ("angles", None) and is_called(
-        topic.name, GIMBAL if kind else frozenset({"gimbal", "ptz"})
-    )
+    if kind_of(topic) is None:
+        named = _ANGLES.search(f"{topic.name} {topic.type}")
+        return named is not None and is_called(topic.name, frozenset({"gimbal", "ptz"}))
+    return kind_of(topic) == "angles" and is_called(topic.name, GIMBAL)
 
 
 def _refuse_unsound(flight_path: Path, description: Description) -> None:

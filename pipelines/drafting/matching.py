@@ -513,9 +513,11 @@ def _measure_lenses(cameras: Sequence[CameraDraft], focal_by_film: FocalByFilm) 
         alike = [measured[c.name] for c in cameras if c.name in measured and c.film and c.film.size == size]
         if alike:
             usual = float(np.median(alike))
-            own = measured.get(camera.name, usual)
-            camera.focal_35_mm = usual if abs(own - usual) < SAME_LENS_SHARE * usual else own
-            camera.focal_by_film = True
+            # What a file states of a camera counts more than the films of others: it may be of another kind.
+            own = measured.get(camera.name, camera.focal_35_mm or usual)
+            is_alike = abs(own - usual) < SAME_LENS_SHARE * usual
+            camera.focal_35_mm = usual if is_alike else own
+            camera.focal_by_film = is_alike or camera.name in measured
 
 
 def known_start(camera: CameraDraft) -> VideoStart | None:

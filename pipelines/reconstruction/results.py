@@ -8,6 +8,7 @@ what limits it.
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from itertools import permutations, product
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,50 @@ def _summed(residual: Float) -> Series:
     there = np.isfinite(residual)
     axes = tuple(range(1, residual.ndim))
     return np.where(there, residual, 0.0).sum(axis=axes), there.sum(axis=axes, dtype=np.float64)
+
+
+# Other axes are looked for above this error of a truth, and named where they make it smaller than this share.
+_LEAST_OF_AXES_MM, _SHARE_OF_AXES = 300.0, 0.2
+# So many moments of a flight tell the axes of its truth.
+_MOMENTS_OF_AXES = 100
+# What names the axes of a file of joints that are the world's x, y and z.
+_KEYS_OF_AXES = {
+    "z, x, y": "up: y",
+    "y, z, x": "up: z",  # of a file that is read as if y pointed up
+    "x, -y, -z": "up: -z",
+    "y, x, -z": "axes: ned",
+}
+
+
+def other_axes_of_truth(observations: Observations, result: Triangulation, truth: Float | None) -> str | None:
+    """Return a warning if a right-angled turn of the truth [T, P', J, 3] takes its error away."""
+    if truth is None:
+        return None
+    shape = observations.confidence.shape[:3]
+    ok = result.status.reshape(shape) == _OK
+    some = slice(None, None, len(ok) // _MOMENTS_OF_AXES + 1)
+    position = np.where(ok[..., None], result.points.reshape(*shape, 3), np.nan)[some]
+
+    def error_mm(turn: Float) -> float:
+        return _mean_mm(position - own_truth(position, truth[some] @ turn.T)) or 0.0
+
+    stated_mm = error_mm(np.eye(3))
+    if stated_mm < _LEAST_OF_AXES_MM:
+        return None
+    signed = (
+        np.diag(signs)[list(order)].astype(float)
+        for order in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
+    )
+    turn = min((each for each in signed if np.linalg.det(each) > 0), key=error_mm)
+    if (least_mm := error_mm(turn)) > _SHARE_OF_AXES * stated_mm:
+        return None
+    axes = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in turn)
+    remedy = f"state `truth: {{{_KEYS_OF_AXES[axes]}}}`" if axes in _KEYS_OF_AXES else "turn its file"
+    return (
+        f"the truth has other axes: its error is {stated_mm:.0f} mm, and {least_mm:.0f} mm if its {axes} are"
+        f" the world's x, y, z; {remedy}"
+    )
 
 
 def _mean_mm(error_m: Float) -> float | None:

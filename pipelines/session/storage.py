@@ -252,13 +252,20 @@ def drop_link(path: Path) -> None:
         path.unlink()
 
 
-def read_json(path: Path, remedy: str = "run the stage that wrote it again with --force") -> dict[str, Any]:
-    """Read a JSON object; DataError if it is missing, too large, no JSON or no object, or holds NaN."""
+def read_json(
+    path: Path, remedy: str = "run the stage that wrote it again with --force", *, takes_nan: bool = False
+) -> dict[str, Any]:
+    """Read a JSON object; DataError if it is missing, too large, no JSON or no object.
+
+    With `takes_nan`, NaN and infinities of others' files become null; else they are a DataError.
+    """
     refuse_special(path)
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
             raise DataError(path, f"has more than {MAX_JSON_BYTES >> 20} MB", remedy, code="too-large")
-        document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+        document = json.loads(
+            path.read_bytes(), parse_constant=(lambda _: None) if takes_nan else _refuse_constant
+        )
     except OSError as error:
         raise as_data_error(error, path) from error
     except (ValueError, RecursionError) as error:
@@ -479,7 +486,7 @@ def is_made(target: Path, key: str, *, mark: str) -> bool:
         return False
     work = _work_of(target)
     with suppress(OSError, BusyError):
-        if made and work.is_dir():
+        if made and work.is_dir() and not work.is_symlink():
             with working_folder(work, target):
                 for left in [path for path in work.iterdir() if path.is_dir()]:
                     remove_tree(left)

@@ -587,7 +587,7 @@ def _is_airsim(head: str) -> bool:
 
 def _read_airsim(path: Path) -> Cameras:
     """Read `CameraDefaults`, and the cameras of vehicles as "vehicle/camera", with the mount as a note."""
-    settings = read_json(path, AGAIN)
+    settings = read_json(path, AGAIN, takes_nan=True)  # in its documentation, too
     blocks = {"CameraDefaults": settings.get("CameraDefaults", {})}
     for vehicle, stated in _mapping(path, settings.get("Vehicles", {})).items():
         for camera, block in _mapping(path, _mapping(path, stated).get("Cameras", {})).items():
@@ -623,9 +623,10 @@ def _airsim_camera(
     matrix = _matrix_of(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     lens = intrinsics(path, name, size=[width, height], matrix=matrix, distortion=[], fisheye=False)
     keys = ("X", "Y", "Z", "Pitch", "Roll", "Yaw")
-    x, y, z, pitch, roll, yaw = numbers(path, name, [block.get(key, 0.0) for key in keys]).tolist()
+    placed = [0.0 if block.get(key) is None else block[key] for key in keys]
+    x, y, z, pitch, roll, yaw = numbers(path, name, placed).tolist()
     note = ""
-    if any(key in block for key in keys):
+    if any(block.get(key) is not None for key in keys):
         arm = f"[{x:g}, {0 - y:g}, {0 - z:g}]"
         note = (
             f"sits on its vehicle as mount: {{looks: forward, down_deg: {0 - pitch:g}, translation: {arm}}}"

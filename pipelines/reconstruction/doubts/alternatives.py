@@ -237,9 +237,10 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     across = np.linalg.svd(trunk[None])[2][1:]
     about = np.stack(np.meshgrid(_SEARCHED, _SEARCHED), axis=-1).reshape(-1, 2) @ across
     ups = np.vstack([z, (trunk + about) / np.linalg.norm(trunk + about, axis=1, keepdims=True)])
-    rotation = trial.described.rotation
+    posed = [camera for camera in trial.every if np.isfinite(trial.described.rotation[camera]).any()]
+    rotation = trial.described.rotation[posed]
     rolls2 = np.nanmean((rotation[..., 0] @ ups.T) ** 2, axis=1)  # [C, U]
-    sigma2 = np.radians(ROLL_DEG) ** 2 + trial.described.sigma[:, 1] ** 2
+    sigma2 = np.radians(ROLL_DEG) ** 2 + trial.described.sigma[posed, 1] ** 2
     cost = (rolls2 / sigma2[:, None]).sum(axis=0) + ((ups - trunk) ** 2).sum(axis=1) / np.radians(
         LEAN_DEG
     ) ** 2

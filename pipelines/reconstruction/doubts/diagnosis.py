@@ -148,9 +148,10 @@ def doubts_of(
         size_m = stature_m(truth.position[:, 0])
         flight = flight._replace(truth_m=size_m if np.isfinite(size_m) else None)
     found = diagnose(flight, late)
-    # A gimbal that nothing uses explains more than any other change would.
+    # A gimbal that nothing uses, where it can be, explains more than any other change would.
     unused = [doubt for doubt in description.doubts if doubt.code == "unused" and found]
-    return [*unused, *(doubt for doubt in found if not unused or not doubt.remedy)]
+    is_mended = any(doubt.remedy for doubt in unused)
+    return [*unused, *(doubt for doubt in found if not is_mended or not doubt.remedy)]
 
 
 def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, float | str]]) -> list[Doubt]:
