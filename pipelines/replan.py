@@ -61,7 +61,7 @@ from pipelines.simulation.detector_errors import (
 )
 from pipelines.simulation.scenario import DetectorErrors
 
-REPLAN_STAGE = Stage("replan", revision=11)
+REPLAN_STAGE = Stage("replan", revision=12)
 
 # The detector's errors were measured by the size of a person of this height in the picture.
 PERSON_HEIGHT_M = 1.75

@@ -37,6 +37,7 @@ from pipelines.planning.scene import (
     ReplayScene,
     build_scene,
     load_flight,
+    map_doubts,
     walked_otherwise,
 )
 from pipelines.reconstruction.refining import refined_points
@@ -91,7 +92,7 @@ from pipelines.simulation.walks import (
 )
 
 # It is raised whenever the same study gives other figures than before.
-_REVISION = 9
+_REVISION = 10
 # A study with more combinations would take days.
 _MAX_CELLS = 500
 _COMMA = r",(?![^\[]*\])"  # not between brackets
@@ -369,7 +370,7 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
                 raise _no_skeleton(place)
             errors = detector_errors(session)
             model = error_model(errors, flight.skeleton.joints)
-            maps = load_maps(place) if description.map else []
+            maps = sorted(load_maps(place), key=lambda one: one.from_ns) if description.map else []
             scenes: dict[str, ReplayScene] = {}
             progress.start("Replaying", len(cells))
             walks = _walks(stated, flight, maps)
@@ -415,7 +416,7 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
                 "best": best,
                 "cells": rows,
                 "verdict": _verdict(rows, best),
-                "warnings": [*flight.warnings, *few_trials(settings.trials)],
+                "warnings": [*flight.warnings, *few_trials(settings.trials), *_doubts(scenes, maps)],
             }
             return metrics, every
 
@@ -476,6 +477,16 @@ def _walk_of(text: str) -> OtherWalk:
             )
         (found[name],) = numbers({name: [value]}, name, float, *limits[name])
     return OtherWalk(found.get("speed", 1.0), found.get("delay", 0.0), found.get("turn", 0.0))
+
+
+def _doubts(scenes: Mapping[str, ReplayScene], maps: Sequence[Occupancy]) -> list[str]:
+    """List what the maps lack for the first of the scenes, and in how many they lack something else."""
+    first, *rest = (map_doubts(scene, maps) for scene in scenes.values())
+    more = [doubts for doubts in rest if set(doubts) - set(first)]
+    if not more:
+        return first
+    example = next(doubt for doubt in more[0] if doubt not in first)
+    return [*first, f"in {len(more)} of {len(scenes)} walks or settings other map troubles, as: {example}"]
 
 
 def _by_combination(rows: Sequence[Row]) -> list[list[int]]:
@@ -651,8 +662,9 @@ def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any]) -> dict[st
 
 def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
     own = rows[best["cell"]]
+    ends = "" if own["low_mm"] is None else f" [{own['low_mm']:.1f}, {own['high_mm']:.1f}]"
     words = [
-        f"best is {_named(own)}: {own['capped_mm']:.1f} mm over all joints,"
+        f"best is {_named(own)}: {own['capped_mm']:.1f}{ends} mm over all joints,"
         f" {100 * own['pck150']:.1f} % within 150 mm,"
         f" {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
     ]

@@ -134,7 +134,7 @@ def triangulate(
     """Triangulate every joint-frame by a method of the module; ValueError for min_views below 2, or no gate.
 
     `gate` counts standard deviations of a view's image point, pixel and pose noise together. Covariances are
-    NaN `with_covariance` False, which saves a third of the time. Statuses besides
+    NaN without `with_covariance`, which saves a third of the time. Statuses besides
     "ok":
 
     * `not_detected`: by no camera.

@@ -15,6 +15,7 @@ from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.metrics import LEVEL, STRETCH_S, intervals
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import TILT, slot_of
+from pipelines.planning.imperfections import blown
 from pipelines.planning.replay import (
     LOGGED,
     ArmFlight,
@@ -206,6 +207,7 @@ def _scores(
         scene.config,
         people=scene.people,
         seen=seen,
+        pushed=0.0 if name in LOGGED else blown(np.zeros_like(flown.position), scene.t_s, scene.config),
     )
     own = result.measured
     figures = _NOTHING if own is None or shared is None else figures_of(own, None, shared)
@@ -412,7 +414,7 @@ def few_trials(trials: int) -> list[str]:
     """Warn of intervals from few draws, in one line."""
     if trials >= FEW_TRIALS:
         return []
-    return [f"{trials} draws of noise are few: take {FEW_TRIALS} or more, or do not trust the intervals"]
+    return [f"few draws of noise ({trials}): take {FEW_TRIALS} or more, or do not trust the intervals"]
 
 
 def _warnings(scene: ReplayScene, results: Mapping[str, ArmResult]) -> list[str]:

@@ -626,7 +626,7 @@ def build_scene(
         notes=tuple(notes),
         warnings=(),
     )
-    return replace(scene, warnings=(*flight.warnings, *_map_doubts(scene, maps), *_doubts(scene)))
+    return replace(scene, warnings=(*flight.warnings, *map_doubts(scene, maps), *_doubts(scene)))
 
 
 def with_pose_errors(
@@ -653,7 +653,7 @@ def with_pose_errors(
     )
 
 
-def _map_doubts(scene: ReplayScene, maps: Sequence[Occupancy]) -> list[str]:
+def map_doubts(scene: ReplayScene, maps: Sequence[Occupancy]) -> list[str]:
     """List what the maps (in the order of `scene.fields`) lack where people walk and drones fly."""
     doubts = []
     if scene.fields and not any(field.has_obstacles for field in scene.fields):

@@ -146,13 +146,15 @@ def score(
     *,
     people: Float | None = None,
     seen: Bool | None = None,
+    pushed: Float | float = 0.0,
 ) -> Scores:
     """Compute the figures of one flight, JSON-able: degrees and metres by name, None where nothing counts.
 
     `position` [N, T, 3] m are the cameras, `actor` [T, 3] or [N, T, 3] whom they film; all finite. `people`
     are [P, T, 3] if there are several: shares and errors are means over them, distances are those to the
     nearest. `seen` is [P, N, T], by default the free lines of sight to the actor. `limit_violations` counts
-    episodes of each drone (of each pair for separation). `path_m` and `energy_kj` are means over drones,
+    episodes of each drone (of each pair for separation); speeds are those without the way [N, T, 3] to which
+    gusts `pushed`. `path_m` and `energy_kj` are means over drones,
     `blind_s` is the time in which fewer than two of them see the actor, `predicted_error_m` sqrt(tr S) of the
     ray model while two free views or more determine it.
     """
@@ -167,7 +169,7 @@ def score(
     turned = np.array([wrapped(slots[j, :, YAW] - slots[i, :, YAW]) for i, j in pairs])
     error = errors_of_views(position, people, seen, config)
     determined = np.isfinite(error)
-    motion, energy_kj = _motion(t_s, position), used_kj(t_s, position, config)
+    motion, energy_kj = _motion(t_s, position - pushed), used_kj(t_s, position, config)
     battery_kj = config.imperfections.battery_kj
     limits = {"speed": config.speed_mps, "acceleration": config.acceleration_mps2, "jerk": config.jerk_mps3}
     violations = {

@@ -205,7 +205,10 @@ def _table_of_session(metrics: Mapping[str, Any]) -> StudyTable:
         for name in columns:
             value = cell[name]
             if isinstance(value, float):
-                value = f"{100 * value if name in percent else value:.1f}"
+                shown = f"{100 * value if name in percent else value:.1f}"
+                value = f"{value:g}" if name in others else shown
+            if name == "capped_mm" and cell["low_mm"] is not None:
+                value += f" ±{(cell['high_mm'] - cell['low_mm']) / 2:.1f}"
             row.append("-" if value is None else str(value))
         rows.append([*row, "best" if cell["best"] else "trade-off" if cell["tradeoff"] else ""])
     return StudyTable("Combinations", [*columns.values(), ""], 4 + len(others), rows)
