@@ -236,7 +236,14 @@ def walked_otherwise(flight: LoggedFlight, walk: OtherWalk, maps: Sequence[Occup
         new_ns, place = moved(of.t_ns, partial(points_at, of))
         return JointMotion(new_ns, of.joints, place)
 
-    new_ns, actor = moved(t_ns, lambda old_ns: positions_at(t_ns, flight.actor, old_ns).swapaxes(0, 1))
+    def people(old_ns: Int64) -> Float:
+        place = positions_at(t_ns, flight.actor, old_ns).swapaxes(0, 1)
+        for p, known in enumerate(np.isfinite(flight.actor[..., 0]).T):
+            first, last = t_ns[known][[0, -1]]
+            place[(old_ns < first) | (old_ns > last), p] = np.nan
+        return place
+
+    new_ns, actor = moved(t_ns, people)
     return replace(
         flight, actor_t_ns=new_ns, actor=actor, hips=motion(flight.hips), skeleton=motion(flight.skeleton)
     )
