@@ -241,20 +241,22 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     rotation = trial.described.rotation[posed]
     rolls2 = np.nanmean((rotation[..., 0] @ ups.T) ** 2, axis=1)  # [C, U]
     sigma2 = np.radians(ROLL_DEG) ** 2 + trial.described.sigma[posed, 1] ** 2
-    cost = (rolls2 / sigma2[:, None]).sum(axis=0) + ((ups - trunk) ** 2).sum(axis=1) / np.radians(
-        LEAN_DEG
-    ) ** 2
-    up = ups[np.argmin(cost)]
+    rolled = (rolls2 / sigma2[:, None]).sum(axis=0)
+    cost = rolled + ((ups - trunk) ** 2).sum(axis=1) / np.radians(LEAN_DEG) ** 2
+    best = int(np.argmin(cost))
+    up = ups[best]
     tilt_deg, of_trunk_deg, left_deg = (
         float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) for cosine in (up @ z, trunk @ z, trunk @ up)
     )
     lost = float(np.nanmean(-rotation[..., 1] @ (z - up)))
-    gain = float(cost[0] - cost.min())
+    gain = float(cost[0] - cost[best])
+    # Cameras that look the same way are not rolled where somebody lies along it: their edges must rise.
+    is_rolled = rolled[0] - rolled[best] >= LEAST_GAIN_OF_UP / 2
     if (
         tilt_deg < AXIS_WITHIN_DEG
         or gain < LEAST_GAIN_OF_UP
         or left_deg > of_trunk_deg / 2
-        or lost > MOST_LOSS_OF_EDGES
+        or lost > (MOST_LOSS_OF_EDGES if is_rolled else -MOST_LOSS_OF_EDGES)
     ):
         return
     axis = max(_UPS, key=lambda name: float(_UPS[name] @ up))
