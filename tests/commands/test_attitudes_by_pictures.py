@@ -127,6 +127,9 @@ def test_pictures_say_how_a_camera_turned(tmp_path: Path) -> None:
         shutil.copyfile(folder / "film" / "000.png", folder / "film" / f"{number:03d}.png")
     save(stated, manifest)
     assert mocap("ingest", manifest).code == "no-attitude"
+    camera["mount"] = {"looks": "forward"}
+    save(stated, manifest)
+    assert mocap("ingest", manifest).code == "bad-value"
 
 
 @pytest.mark.long

@@ -139,6 +139,10 @@ def test_c3d_is_truth(tmp_path: Path) -> None:
     said = succeeds("info", tmp_path / "truth.c3d")
     assert "(C3D)" in said
     assert "POINT:UNITS" in said
+    flight.settings["truth"]["up"] = "z"
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    assert "up: y" in mocap("reconstruct", tmp_path / "flight.session").stderr
 
 
 def test_opensim_reads_the_angles_of_the_session(filmed: Path, tmp_path: Path) -> None:
