@@ -368,6 +368,8 @@ def filmed_verdict(
     best: Mapping[str, Any] | None, modelled: Mapping[str, Any] | None, names: Sequence[str]
 ) -> str:
     """Say what the films of the arms show; where the modelled measurement said otherwise, say that, too."""
+    if best is not None and (best["difference"]["pck150"] or {}).get("interval") is None:
+        return f"filmed: too few pictures to tell {' and '.join(names)} apart"
     said = f"filmed: {verdict(best, names)}"
     if best is None or modelled is None or outcome(best) == outcome(modelled):
         return said
