@@ -17,7 +17,7 @@ from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import read_text
+from pipelines.session.storage import empty, read_text
 
 _POINT = re.compile(r"(?s)<(?:\w+:)?trkpt\b([^>]*)>(.*?)</(?:\w+:)?trkpt>")
 _ATTRIBUTE = r"\b{}\s*=\s*[\"']([^\"']*)[\"']"
@@ -180,6 +180,8 @@ def _airsim_rows(path: Path) -> tuple[list[str], Int64, Float, dict[str, int]]:
     table = rows_below(path, heading, text, named, columns)
     t_ns, timed = parse_stamps(path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated)
     names = table.text["vehicle"].to_pylist() if named else ["vehicle"] * len(t_ns)
+    if not timed.any():
+        raise empty(path, "holds no pose with a time")
     lost = {"truncated last line": table.truncated, "no time": int((~timed).sum())}
     values = table.stack((*POSITION, *QUATERNION))[timed]
     names = [str(name) for name, known in zip(names, timed, strict=True) if known]
