@@ -174,7 +174,7 @@ def test_real_lidar(tmp_path: Path) -> None:
     pose = {"file": str(real_data(HUSKY)), "of": "body"}
     about: dict[str, Any] = {"file": "lidar", "topic": "/luminar_pointcloud"}
     path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
-    assert re.search("'luminar_lidar'.*`parent:`", refused("ingest", path))
+    assert re.search("(?s)'luminar_lidar'.*`parent:`", refused("ingest", path))
     about |= {"parent": "luminar_lidar", "resolution_m": 0.5}
     path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
     done = mocap("ingest", path)
