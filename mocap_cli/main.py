@@ -128,15 +128,13 @@ def print_error(error: MocapError) -> None:
 
     remedy = error.remedy if isinstance(error, DataError) else ""
     changes = [as_instruction(change) for change in remedy.split("; ")]
-    parts = [str(error)]
-    source = str(error.source) if isinstance(error, DataError) else ""
-    if len(parts[0]) - len(source) > MAX_LINE_CHARACTERS or changes[0].startswith(
-        ("set cameras.", "set world.")
-    ):
+    source = f"{error.source}: " if isinstance(error, DataError) else ""
+    parts = [str(error).removeprefix(source)]
+    if len(parts[0]) > MAX_LINE_CHARACTERS or changes[0].startswith(("set cameras.", "set world.")):
         problems = parts[0].removesuffix(f"; {remedy}") if remedy else parts[0]
         parts = [*problems.split("; "), *(changes if remedy else [])]
     for number, part in enumerate(parts):
-        say(f"  {one_line(part)}" if number else f"mocap: {one_line(part)}", err=True)
+        say(f"  {one_line(part)}" if number else f"mocap: {one_line(source + part)}", err=True)
 
 
 class _Lazy(Mocap):

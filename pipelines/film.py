@@ -51,7 +51,7 @@ FILM = Stage("film", revision=10)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
-# Students' factor for ten draws of the poses' noise is 2.3; each takes as long as a picture or two.
+# Student's factor for ten draws is 2.3, and hardly less for more. Each takes as long as a picture or two.
 DRAWS = 10
 # A detection whose joints lie farther than this from a person's, in the median, shows somebody else.
 MAX_MEDIAN_OFF_M = 0.25

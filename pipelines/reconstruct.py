@@ -371,13 +371,15 @@ def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> 
         return
     codes, counts = np.unique(status, return_counts=True)
     gates = ", ".join(f"{STATUS[code]} {count}" for code, count in zip(codes, counts, strict=True))
-    cause = next((doubt for doubt in doubts[:1] if doubt.remedy), None)
-    why = [cause.what] if cause else [f"{gates}, {noise_text(attempt.views)}", *attempt.association.reasons]
+    causes = [doubt for doubt in doubts[:2] if doubt.remedy and doubts[0].remedy]
+    why = [f"{gates}, {noise_text(attempt.views)}", *attempt.association.reasons]
+    if causes:  # what explains nearly as much is said beside the first
+        why = [", or ".join(doubt.what for doubt in causes)]
     advice = "check calibration, clocks and poses, or state another pose noise with --pose-noise"
     raise DataError(
         folder,
         "; ".join(["no joint could be reconstructed", *why]),
-        cause.remedy if cause else advice,
+        causes[0].remedy if causes else advice,
         code="nothing-reconstructed",
     )
 
@@ -672,7 +674,9 @@ def _brought_together(
         for camera, by in zip(cameras, shift, strict=True)
     ]
     far = ", ".join(f"{c.name} {np.linalg.norm(by):.1f} m" for c, by in zip(cameras, shift, strict=True))
-    return moved, [f"rays of people do not meet: cameras start where people are {stature_m:g} m tall ({far})"]
+    return moved, [
+        f"logged positions are metres off: cameras were moved until people look {stature_m:g} m tall ({far})"
+    ]
 
 
 def clocks_of(

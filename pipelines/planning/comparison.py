@@ -324,16 +324,18 @@ def judge(
         for one, other in permutations(kept, 2)
     }
     judged = {pair: worth_flying(found) for pair, found in change.items()}
-    beaten = {other for (_, other), signs in judged.items() if max(signs) > 0 and min(signs) >= 0}
-    unbeaten = [name for name in kept if name not in beaten] or kept
-    rest = [name for name in kept if name not in unbeaten]
-    first, second = unbeaten[0], (unbeaten[1:] or rest)[0]
+    beats = {pair for pair, signs in judged.items() if max(signs) > 0 and min(signs) >= 0}
+    unbeaten = [name for name in kept if not any(other == name for _, other in beats)]
+    worse = [name for name in kept if any((one, name) in beats for one in unbeaten)]
+    if len(unbeaten) + len(worse) < 2:  # the others beat each other in a circle
+        unbeaten, worse = kept, []
+    first, second = unbeaten[0], (unbeaten[1:] or worse)[0]
     disagreeing = next((pair for pair in permutations(unbeaten, 2) if judged[pair] == [1, -1]), None)
     first, second = disagreeing or (first, second)
     return {
         "arms": unbeaten,
         "disagree": disagreeing is not None,
-        "worse": rest,
+        "worse": worse,
         "left_out": [name for name in able if name not in kept],
         "difference": {"arm": first, "against": second, **change[first, second]},
     }

@@ -11,6 +11,10 @@ from pipelines.planning.formation import wrapped
 OUTAGE_S = 2.0
 # Gusts at the height of drones last for seconds.
 GUST_S = 2.0
+# Outages and gusts are the same for every arm.
+OUTAGE_SEED, GUST_SEED = 1, 2
+# Gusts blow half as strongly upwards as along level axes.
+GUST_SHARES = (1.0, 1.0, 0.5)
 # Rotors of small drones drag by 0.2 to 0.5 of the air's speed a second (Faessler et al. 2018).
 DRAG_PER_S = 0.3
 
@@ -18,7 +22,7 @@ DRAG_PER_S = 0.3
 def outages(t_s: Float, imperfections: Imperfections) -> Bool:
     """Mark the times [T], ascending, at which drones hear nobody: stretches of 2 s, by chance."""
     blocks = np.asarray((t_s - t_s[0]) // OUTAGE_S, dtype=np.int64)
-    lost = np.random.default_rng(1).random(blocks[-1] + 1) < imperfections.outage_share
+    lost = np.random.default_rng(OUTAGE_SEED).random(blocks[-1] + 1) < imperfections.outage_share
     lost[0] = False
     found: Bool = lost[blocks]
     return found
@@ -33,17 +37,14 @@ def blown(position: Float, t_s: Float, config: PlannerConfig) -> Float:
     gust_mps = config.imperfections.gust_mps
     if not gust_mps:
         return position
-    rng, tuning = np.random.default_rng(2), config.tuning
+    rng, tuning = np.random.default_rng(GUST_SEED), config.tuning
     off, rate, total = (np.zeros((len(position), 3)) for _ in range(3))
-    gust = gust_mps * rng.standard_normal(off.shape) * [1.0, 1.0, 0.5]
+    sigma_mps = gust_mps * np.array(GUST_SHARES)
+    gust = sigma_mps * rng.standard_normal(off.shape)
     pushed = np.zeros_like(position)
     for k, step_s in enumerate(np.diff(t_s), start=1):
         kept = np.exp(-step_s / GUST_S)
-        gust = kept * gust + np.sqrt(1 - kept**2) * gust_mps * rng.standard_normal(off.shape) * [
-            1.0,
-            1.0,
-            0.5,
-        ]
+        gust = kept * gust + np.sqrt(1 - kept**2) * sigma_mps * rng.standard_normal(off.shape)
         total = total + off * step_s
         feedback = tuning.k_position * off + tuning.k_velocity * rate + tuning.k_integral * total
         rate = rate + (DRAG_PER_S * gust - feedback) * step_s

@@ -13,7 +13,8 @@ centimetres, it stands on the ground, its joints have ranges, and it moves smoot
 Moments are 0.2 s apart. A second difference couples three of them; two moments make one block of a block
 tridiagonal matrix, which is eliminated in the order of time. Shape, offsets and level are its border. A
 single view of a limb fits two poses, towards the camera and away from it. So each moment is first fitted by
-itself from the likeliest of eight headings, upright or not, and the smoothest sequence is chosen (Viterbi).
+itself from the likeliest of 32 postures (eight headings; upright, upside down, on the face and on the back),
+and the smoothest sequence is chosen (Viterbi).
 """
 
 from __future__ import annotations
@@ -94,8 +95,9 @@ _WIDENED = 1.3
 # Limbs that bend towards the camera unseen make a person look nearer: on the tuning flights distances err by
 # this share beside what the fit says.
 _DISTANCE_SHARE = 0.02
-# Headings that are 45 deg apart reach every other one within the range of the linear model.
-_HEADINGS, _KEPT_HEADINGS = 8, 3
+# Headings that are 45 deg apart reach every other one within the range of the linear model. Each moment is
+# fitted from so many of the postures.
+_HEADINGS, _KEPT_POSTURES = 8, 3
 # Bones turn by this in the root of a second, rad, when the smoothest sequence of poses is chosen.
 _TURN_RAD = 1.5
 # A jump to another sequence of poses costs no more than this.
@@ -541,7 +543,7 @@ def _first_poses(points: StandingPoints, rays: Rays, turns: Float, t_s: Float) -
         level = float(np.median(likeliest[:, 2]) + points.prior.mean[0] * sole)
     shared = Shared(points.prior.mean[:12].copy(), np.zeros((len(points.bone), 3)), level)
     found, costs = [], []
-    order = np.argsort(error, axis=0)[:_KEPT_HEADINGS]
+    order = np.argsort(error, axis=0)[:_KEPT_POSTURES]
     for heading in order:
         start = Poses(root[heading, np.arange(len(t_s))], turns[heading])
         parts = [

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float, Picture
-from pipelines.keypoints import blazepose
 from pipelines.keypoints.blazepose import DETECTOR, BlazePose
 from pipelines.session.errors import DataError
 from pipelines.session.model_files import ModelFile, NpmPackage, PackagedModels, Wheel
@@ -190,16 +189,6 @@ def test_joints_outside_of_the_crop_have_no_confidence(networks: BlazePose, samp
         outside += int(beyond.sum())
         assert not person.confidence[beyond].any()
     assert outside  # else nothing was tested
-
-
-@pytest.mark.parametrize(
-    ("top", "angle"), [((50, 0), 0.0), ((90, 40), np.pi / 2), ((50, 80), np.pi), ((10, 40), -np.pi / 2)]
-)
-def test_a_region_is_turned_as_its_person(top: tuple[float, float], angle: float) -> None:
-    region = blazepose._region(np.array([50.0, 40.0]), np.array(top, float))
-    assert region.centre == (50.0, 40.0)
-    assert region.side == pytest.approx(2 * 40 * 1.25)
-    assert region.angle_rad == pytest.approx(angle)
 
 
 TAGS = ("3.11", "cp311", "manylinux_2_28_x86_64")  # as pinned: not what this machine needs to be

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.planning.config import PlannerConfig, PlannerTuning
-from pipelines.planning.distance_field import distance_field, visible
+from pipelines.planning.config import ErrorModel, PlannerConfig, PlannerTuning
+from pipelines.planning.distance_field import distance_field, in_turn, visible
 from pipelines.planning.formation import (
     FormationPath,
     cost_map,
@@ -43,6 +43,20 @@ def test_what_the_ends_of_a_line_tell_changes_no_cost(seed: int, share: float, e
     assert (costs.occluded == expected).mean() > 0.95
     total = (2 * costs.obstacle + 3 * costs.occluded).sum(axis=2)
     assert cost_map(costs, CONFIG) == pytest.approx(total, abs=1e-12)
+
+
+@pytest.mark.parametrize("gamma", np.radians([30.0, 60.0, 90.0, 150.0]))
+def test_error_of_two_cameras_as_in_closed_form(gamma: float) -> None:
+    """Tr S = s^2 (1/2 + 2/sin^2 gamma) for equal cameras whose rays cross at gamma."""
+    errors = ErrorModel(rotation_sigma_deg=0.8)
+    level = (
+        np.interp(0.0, errors.tilts_deg, each) for each in (errors.keypoint_sigma_m, errors.placed_share)
+    )
+    keypoint_m, placed = level
+    s2 = keypoint_m**2 + (10 * np.radians(0.8)) ** 2 + errors.position_sigma_m**2
+    offset = 10 * np.array([[1.0, 0.0, 0.0], [np.cos(gamma), np.sin(gamma), 0.0]])
+    error = predicted_error(ray_information(offset, errors).sum(axis=0))
+    assert error**2 == pytest.approx(s2 / placed * (0.5 + 2 / np.sin(gamma) ** 2), rel=1e-9)
 
 
 @given(st.integers(0, 10_000))
@@ -98,6 +112,15 @@ def test_cameras_see_through_what_drones_avoid() -> None:
     seen = {word: bool(visible(field, camera, actor, start_m=0.0)[0]) for word, field in fields.items()}
     assert seen == {"free": True, "occupied": False, "avoided": True}
     np.testing.assert_array_equal(fields["avoided"].sight.bricks, fields["free"].sight.bricks)
+
+
+def test_each_map_holds_from_its_own_time_on() -> None:
+    t_ns, one = np.arange(10, dtype=np.int64), slab()
+    first, second = (distance_field(Occupancy(one.probability, np.zeros(3), RES, from_ns=n)) for n in (3, 6))
+    before, *after = in_turn([first, second], t_ns)
+    assert not before[1].has_obstacles
+    assert after == [(slice(3, 6), first), (slice(6, 10), second)]
+    assert [rows for rows, _ in in_turn([first, second], t_ns[4:])] == [slice(0, 2), slice(2, 6)]
 
 
 RATES = np.array([np.radians(22.5), np.radians(5.0), 1.0])

@@ -429,10 +429,8 @@ def test_a_world_of_another_scale_is_named_with_its_scale(flight: Described, fac
     assert first["code"] == "scale"
     # 95 % of grown-ups are within 17 % of the usual stature.
     # The map and the actor are right, so poses alone are scaled.
-    scales = [
-        float(scale) for scale in re.findall(r"pose\.world_from_source: {scale: ([0-9.]+)}", first["remedy"])
-    ]
-    assert np.array(scales) * factor == pytest.approx(np.ones(3), rel=0.17)
+    scales = re.findall(r"pose\.world_from_source: {scale: ([0-9.]+)}", first["remedy"])
+    assert np.array(scales, float) * factor == pytest.approx(np.ones(3), rel=0.17)
 
 
 def test_limbs_that_cross_are_doubted_without_a_cause(flight: Described) -> None:

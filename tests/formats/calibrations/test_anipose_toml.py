@@ -27,7 +27,6 @@ rotation = [0.0, 0.0, 1.5707963267948966]
 translation = [1, 2, 3]
 """
 
-
 AIRSIM = """{"SettingsVersion": 1.2, "SimMode": "Multirotor",
  "CameraDefaults": {"CaptureSettings": [{"ImageType": 5, "Width": 9}, {"ImageType": 0, "FOV_Degrees": 120}]},
  "Vehicles": {"D1": {"Cameras": {"front": {"CaptureSettings":
@@ -106,17 +105,9 @@ def test_settings_of_airsim_give_lenses_by_their_field_of_view(tmp_path: Path) -
     path = tmp_path / "settings.json"
     path.write_text(AIRSIM, encoding="utf-8")
     cameras = calibration_files.AIRSIM.read_calibration(path)
-    for name, width, height, focal_px in (
-        ("D1/front", 640, 480, 320),
-        ("CameraDefaults", 256, 144, 128 / 3**0.5),
-    ):
+    for name, width, height, focal_px in ("D1/front", 640, 480, 320), ("CameraDefaults", 256, 144, 73.9008):
         lens = cameras[name].intrinsics
         assert lens is not None
-        assert (lens.width, lens.height, lens.cx, lens.cy) == (
-            width,
-            height,
-            (width - 1) / 2,
-            (height - 1) / 2,
-        )
-        assert (lens.fx, lens.fy) == pytest.approx((focal_px, focal_px))
+        found = lens.width, lens.height, 2 * lens.cx + 1, 2 * lens.cy + 1, lens.fx, lens.fy
+        assert found == pytest.approx((width, height, width, height, focal_px, focal_px), rel=1e-6)
     assert "down_deg: 15, translation: [0.5, -0.25, -0.125]" in cameras["D1/front"].note
