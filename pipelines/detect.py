@@ -329,15 +329,6 @@ _NETWORKS = local()
 """Networks of each thread: only one thread may use them at a time, and threads of a cluster keep theirs."""
 
 
-def _networks(detector: Detector) -> KeypointNetworks:
-    """Load the detector, once for each thread."""
-    which = detector.name, hashes_of_models(detector)
-    if getattr(_NETWORKS, "which", None) != which:
-        _NETWORKS.loaded, _NETWORKS.which = detector.load(threads=1), which
-    networks: KeypointNetworks = _NETWORKS.loaded
-    return networks
-
-
 @dataclass(frozen=True)
 class _DetectionOrder:
     """A block for a worker."""
@@ -362,7 +353,10 @@ def detect_block(order: _DetectionOrder) -> dict[str, bytes]:
         raise DataError(order.detector.name, problem, remedy, code="wrong-worker")
     description, camera = read_description(folder), order.block.camera
     frame, t_ns = _Work(folder, description, order.every, (None, None)).frames(order.block)
-    networks = _networks(order.detector)
+    which = order.detector.name, hashes_of_models(order.detector)
+    if getattr(_NETWORKS, "which", None) != which:
+        _NETWORKS.loaded, _NETWORKS.which = order.detector.load(threads=1), which
+    networks: KeypointNetworks = _NETWORKS.loaded
     tracker = PeopleTracker(networks, only_one=order.only_one)
     hints = _hints_at(folder, description, camera, t_ns, only_one=order.only_one)
     found: list[tuple[int, int, Float, Float]] = []

@@ -98,7 +98,9 @@ def simulate(
         _write_grid(making.folder / "site.npz", occupancy)
         progress.advance()
         for drone in flight.drones:
-            _write_log(making.folder / f"{drone.name}.mcap", flight, drone)
+            with Ros2Recording(making.folder / f"{drone.name}.mcap") as log:
+                for message in logged_messages(flight, drone):
+                    log.write(message.topic, message.type, message.received_ns, message.fields)
             write_camera_info(making.folder / f"{drone.name}_camera.yaml", drone.name, drone.intrinsics)
             progress.advance()
         if video:
@@ -204,13 +206,6 @@ def _write_grid(path: Path, occupancy: Occupancy) -> None:
         origin=occupancy.origin,
         resolution_m=np.float64(occupancy.resolution_m),
     )
-
-
-def _write_log(path: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
-    """Write the log of one drone's recorder, message by message in the order of receipt."""
-    with Ros2Recording(path) as log:
-        for message in logged_messages(flight, drone):
-            log.write(message.topic, message.type, message.received_ns, message.fields)
 
 
 def _film(

@@ -497,7 +497,9 @@ def without_common_errors(time_s: Float, views: SightLines, seen: Bodies) -> Sig
         # A mean of means has no negative weight at any frequency, so the rounds do not amplify one.
         turn = np.stack([_mean(time_s, _mean(time_s, missed[:, c])) for c in range(missed.shape[1])], axis=1)
         total += turn
-        rotation = rotation @ _turned(turn)
+        across, along = np.moveaxis(turn, -1, 0)
+        vector = np.stack([-along, across, np.zeros_like(across)], axis=-1)
+        rotation = rotation @ matrix_from_quaternion(quaternion_from_rotation_vector(vector))
     small = np.hypot(*np.moveaxis(total, -1, 0)) <= _MAX_CORRECTION_SIGMAS * views.sigma
     if not left[-1] < _MAX_REMAINING_SHARE * left[0]:
         return views
@@ -544,13 +546,6 @@ def _mean(time_s: Float, values: Float) -> Float:
     rows = np.flatnonzero(within[:, 2] > 0)
     mean = within[rows, :2] / within[rows, 2:]
     return np.stack([np.interp(time_s, time_s[rows], column) for column in mean.T], axis=1)
-
-
-def _turned(offset: Float) -> Float:
-    """Return the rotations [..., 3, 3] that move a whole picture by a small offset [..., 2] in it."""
-    across, along = np.moveaxis(offset, -1, 0)
-    vector = np.stack([-along, across, np.zeros_like(across)], axis=-1)
-    return matrix_from_quaternion(quaternion_from_rotation_vector(vector))
 
 
 # --- who is no person ------------------------------------------------------------------------------------
@@ -680,7 +675,12 @@ def _is_bystander(
     ring = np.where(posed, np.hypot(*np.moveaxis(position - nearest[:, None], -1, 0)[:2]), np.nan)
     whole = np.ones(len(rows), np.bool_)
     for c, field in enumerate(fields):
-        shown = _in_picture(body.middle[rows], position[:, c], rotation[:, c], field)
+        u, v, depth = np.einsum("nij,ni->jn", rotation[:, c], body.middle[rows] - position[:, c])
+        left, top, right, bottom = field
+        with np.errstate(invalid="ignore", divide="ignore"):
+            across, along = u / depth, v / depth
+            inside = (across > left) & (across < right) & (along > top) & (along < bottom)
+        shown = np.asarray(inside & (depth > 0), dtype=np.bool_)
         whole &= shown | ~posed[:, c]
     beyond = apart > np.nanmedian(ring, axis=1)
     return bool(beyond.mean() > _MIN_REFUSED_SHARE and whole.mean() < _MIN_COMPANY_SHARE)
@@ -735,13 +735,3 @@ def level_of_most_seen(seen: Bodies) -> Ground | None:
     if not len(people):
         return None
     return level_of(seen.middle[placed & (seen.track == people[views.argmax()])])
-
-
-def _in_picture(places: Float, position: Float, rotation: Float, field: Float) -> Bool:
-    """Test which places [N, 3] are in the pictures of one camera [N]."""
-    u, v, depth = np.einsum("nij,ni->jn", rotation, places - position)
-    left, top, right, bottom = field
-    with np.errstate(invalid="ignore", divide="ignore"):
-        across, along = u / depth, v / depth
-        inside = (across > left) & (across < right) & (along > top) & (along < bottom)
-    return np.asarray(inside & (depth > 0), dtype=np.bool_)

@@ -169,7 +169,10 @@ class BlazePose(PersonFinder):
         return [self._locate(picture, region) for region in regions]
 
     def _locate(self, picture: Picture, region: Region) -> Person:
-        picture_from_crop = _picture_from_crop(region)
+        axes = _axes(region)
+        picture_from_crop = np.column_stack(
+            [axes, np.array(region.centre) - axes @ np.full(2, (_CROP_SIDE - 1) / 2)]
+        )
         crop = sampled(picture, picture_from_crop, (_CROP_SIDE, _CROP_SIDE), beyond="edge")
         raw = self._landmarks(crop)
         landmarks = raw["Identity"].reshape(_LANDMARKS, 5).astype(np.float64)
@@ -334,12 +337,6 @@ def _axes(region: Region) -> Float:
     """Return [2, 2] columns: one crop pixel to the right and one down, in the picture's pixels."""
     cosine, sine = np.cos(region.angle_rad), np.sin(region.angle_rad)
     return np.array([[cosine, -sine], [sine, cosine]]) * region.side / _CROP_SIDE
-
-
-def _picture_from_crop(region: Region) -> Float:
-    """Return [2, 3] picture_from_crop in pixels; both count from the centre of the top left pixel."""
-    axes = _axes(region)
-    return np.column_stack([axes, np.array(region.centre) - axes @ np.full(2, (_CROP_SIDE - 1) / 2)])
 
 
 def _refined(in_crop: Float, heatmap: NDArray[np.floating[Any]]) -> tuple[Float, Float]:

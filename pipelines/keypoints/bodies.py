@@ -171,7 +171,9 @@ def _bodies_of(
         body = np.where(body < 0, body.max() + 1 + np.arange(nodes), body)
     noise2 = 1.0
     for _ in range(_ROUNDS):
-        body = _partition(fixed + _evidence(pairs, noise2, nodes), apart, _Nodes(camera, start, middle), body)
+        weight = (_AGREE_CHI2 - np.minimum(pairs.square / noise2, _MAX_CHI2)) * pairs.trust
+        total = np.bincount(pairs.one * nodes + pairs.other, weight, nodes * nodes).reshape(nodes, nodes)
+        body = _partition(fixed + total + total.T, apart, _Nodes(camera, start, middle), body)
         same = pairs.square[body[pairs.one] == body[pairs.other]]
         learned = float(np.clip(np.median(same) / _USUAL_CHI2, *_NOISE_FACTORS2)) if len(same) else noise2
         if abs(np.log(learned / noise2)) < _SAME_NOISE:
@@ -201,7 +203,7 @@ def _pieces(time_s: Float, points: Float, size: Float) -> tuple[Int64, int]:
     """Join the detections of each camera over time; return their numbers [T, C, D] and their count."""
     usable = np.isfinite(size)
     piece = np.full(size.shape, -1, np.int64)
-    second = _slices(time_s)
+    second = np.floor((time_s - time_s[:1]) / _PIECE_S + 1e-9).astype(np.int64)
     step, count = max(1, _BLOCK // max(size[0].size * size.shape[2], 1)), 0
     for start in range(0, len(size), step):
         t = np.arange(max(start, 1), min(start + step, len(size)))
@@ -223,10 +225,6 @@ def _pieces(time_s: Float, points: Float, size: Float) -> tuple[Int64, int]:
             piece[now][new] = count + np.arange(new.sum())
             count += int(new.sum())
     return piece, count
-
-
-def _slices(time_s: Float) -> Int64:
-    return np.floor((time_s - time_s[:1]) / _PIECE_S + 1e-9).astype(np.int64)
 
 
 def _rivals(shift: Float, axis: int) -> Float:
@@ -345,13 +343,6 @@ def _squares(
     kept = np.maximum(1, 3 * count // 4)
     total = np.take_along_axis(np.cumsum(ordered, axis=-1), kept[:, None] - 1, axis=-1)[:, 0]
     return total / kept, count
-
-
-def _evidence(pairs: _Pairs, noise2: float, nodes: int) -> Float:
-    """Sum the evidence of pairs [N, N] by pieces."""
-    weight = (_AGREE_CHI2 - np.minimum(pairs.square / noise2, _MAX_CHI2)) * pairs.trust
-    total = np.bincount(pairs.one * nodes + pairs.other, weight, nodes * nodes).reshape(nodes, nodes)
-    return np.asarray(total + total.T)
 
 
 def _near_log(views: SightLines, seen: Bool, piece: Int64, rows: Int64, log: Float, count: int) -> Float:

@@ -312,7 +312,12 @@ class PeopleTracker:
             known.see(person)
             return
         if not self._has_place_for(None) and _can_be(person.region, logged):
-            self._make_place(logged)
+            # Drop the newest track that cannot be a logged person: bystanders must not keep them out.
+            held = [track for track in self._tracks if track.missing <= _PATIENCE_PICTURES]
+            others = [track for track in held if not _can_be(track.person.region, logged)]
+            if others:
+                self._tracks.remove(max(others, key=lambda track: track.number))
+                self.counts["lost"] += 1
         if self._has_place_for(None):
             track = _PictureTrack(self._next_number, person)
             track.see(person)
@@ -336,14 +341,6 @@ class PeopleTracker:
         """Test if another person may be followed; people just lost keep their place."""
         held = [other for other in self._tracks if other.missing <= _PATIENCE_PICTURES]
         return track in held or len(held) < self._most_people
-
-    def _make_place(self, logged: Hints) -> None:
-        """Drop the newest track that cannot be a logged person: bystanders must not keep them out."""
-        held = [track for track in self._tracks if track.missing <= _PATIENCE_PICTURES]
-        others = [track for track in held if not _can_be(track.person.region, logged)]
-        if others:
-            self._tracks.remove(max(others, key=lambda track: track.number))
-            self.counts["lost"] += 1
 
     # --- small questions -------------------------------------------------------------------------------
 

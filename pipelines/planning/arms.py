@@ -169,7 +169,9 @@ class _JointPlanner(_TeamPlanner):
         neighbour = _in_a_turn(drones)
         self._yaws = max(round(config.tuning.yaws / neighbour), 1) * neighbour
         tilts = np.clip(config.tilt_rad + tilt_step * np.arange(-1, 2), *np.radians(TILT_LIMITS_DEG))
-        ranges = _steps_through(config.radius_m, (*config.ranges_m, config.radius_m), range_step)
+        reached = (*config.ranges_m, config.radius_m)
+        low, high = (round((end - config.radius_m) / range_step) for end in (min(reached), max(reached)))
+        ranges = config.radius_m + range_step * np.arange(low, high + 1, dtype=np.float64)
         states = _all_states(yaw_set(self._yaws, yaw_rad), np.unique(tilts), ranges)
         self._lattice = _lattice_of(states, config)
         self._offsets = slot_offsets(states)
@@ -253,12 +255,6 @@ class _JointPlanner(_TeamPlanner):
 def _in_a_turn(drones: int) -> int:
     """Return how many neighbours of a formation fill a turn: so many equal parts of it hold their yaws."""
     return 4 if drones == 2 else drones
-
-
-def _steps_through(start: float, reached: Sequence[float], step: float) -> Float:
-    """Return values by steps from a start, as far as they are within those to be reached."""
-    low, high = (round((end - start) / step) for end in (min(reached), max(reached)))
-    return start + step * np.arange(low, high + 1, dtype=np.float64)
 
 
 def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:

@@ -501,7 +501,9 @@ def lattice(states: Float, *, rates: Float, knot_s: float, w_turn: float) -> Lat
 
     `rates` [3] are the largest changes per second, `w_turn` the cost of 2 s of change at the full rate.
     """
-    time_s = _time_between(states[:, None], states, rates)
+    way = states - states[:, None]
+    way[..., YAW] = wrapped(way[..., YAW])
+    time_s = np.abs(way) / rates
     reach, cost = time_s.max(axis=-1), w_turn / 2.0 * time_s.sum(axis=-1)
     within = reach <= knot_s + REACH_MARGIN_S
     order = np.argsort(np.where(within, time_s.sum(axis=-1), np.inf), axis=1, kind="stable")
@@ -510,13 +512,6 @@ def lattice(states: Float, *, rates: Float, knot_s: float, w_turn: float) -> Lat
     inside = np.take_along_axis(within, neighbours, axis=1)
     move = np.take_along_axis(cost, neighbours, axis=1)
     return Lattice(states, rates, knot_s, w_turn, np.where(inside, neighbours, -1), move)
-
-
-def _time_between(start: Float, goal: Float, rates: Float) -> Float:
-    """Compute the seconds that each coordinate needs, [..., 3], broadcast."""
-    way = goal - start
-    way[..., YAW] = wrapped(way[..., YAW])
-    return np.abs(way) / rates
 
 
 @cached

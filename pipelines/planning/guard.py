@@ -240,7 +240,8 @@ class Guard:
 
     def _steered(self, t_s: float, here: Float, velocity: Float) -> DronePlan:
         """Return a plan that takes up a velocity [3] m/s with a constant acceleration."""
-        after = self._waypoint_times()
+        config = self._config
+        after = config.tuning.waypoint_s * np.arange(config.tuning.waypoints + 1, dtype=np.float64)[:, None]
         change = velocity - here[VELOCITY]
         until = float(np.linalg.norm(change)) / (ACCELERATION_SHARE * self._config.acceleration_mps2)
         share = np.minimum(after, until)
@@ -255,11 +256,6 @@ class Guard:
         return DronePlan(
             t_s, states[rows, POSITION], states[0, VELOCITY].copy(), self._config.tuning.waypoint_s
         )
-
-    def _waypoint_times(self) -> Float:
-        """Return the times [N + 1, 1] s of waypoints, from the start of a plan."""
-        config = self._config
-        return config.tuning.waypoint_s * np.arange(config.tuning.waypoints + 1, dtype=np.float64)[:, None]
 
 
 def wanted_clearance_m(config: PlannerConfig, grid: Grid) -> float:

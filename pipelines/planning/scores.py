@@ -220,7 +220,11 @@ def coverage(
     away have 0, and so have people [..., A, 3] (centres of the sides) out of the level field of view. Nobody
     hides anybody. Yaws, of the level axis [...] and of people [..., A], are from east.
     """
-    normal, centre = _faces(people, heading_rad)
+    yaw = heading_rad[..., None] + 2.0 * np.pi / PRISM_SIDES * np.arange(1, PRISM_SIDES + 1)
+    normal = np.zeros((*people.shape[:-1], PRISM_SIDES + 1, 3))
+    normal[..., :PRISM_SIDES, 0], normal[..., :PRISM_SIDES, 1] = np.cos(yaw), np.sin(yaw)
+    centre = people[..., None, :] + PRISM_APOTHEM_M * normal
+    normal[..., PRISM_SIDES, 2] = 1.0
     look = np.stack([np.cos(looks_rad), np.sin(looks_rad), np.zeros_like(looks_rad)], axis=-1)
     to_face = centre - position[..., None, None, :]
     facing = np.maximum(-(to_face * normal).sum(axis=-1), 0.0)
@@ -243,16 +247,6 @@ def view_quality(covered: Float, weight: Float) -> Float:
     area[-1] = 1.5 * np.sqrt(3.0) * side_m**2
     quality: Float = (weight[:, None] * area * np.sqrt(covered)).sum(axis=(-2, -1))
     return quality
-
-
-def _faces(people: Float, heading_rad: Float) -> tuple[Float, Float]:
-    """Return normals and centres [..., A, 7, 3] of the sides and the lid; all centres are at one height."""
-    yaw = heading_rad[..., None] + 2.0 * np.pi / PRISM_SIDES * np.arange(1, PRISM_SIDES + 1)
-    normal = np.zeros((*people.shape[:-1], PRISM_SIDES + 1, 3))
-    normal[..., :PRISM_SIDES, 0], normal[..., :PRISM_SIDES, 1] = np.cos(yaw), np.sin(yaw)
-    centre = people[..., None, :] + PRISM_APOTHEM_M * normal
-    normal[..., PRISM_SIDES, 2] = 1.0
-    return normal, centre
 
 
 def propulsion_w(level_mps: Float, climb_mps: Float) -> Float:

@@ -958,7 +958,20 @@ def refine_cameras(
             t_ns = camera.frame_t_ns[seen.rows]
             found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
             refined.append(_with_poses(camera, t_ns, found))
-            entries[camera.name] = _entry(found)
+            used = found.refused is None
+            turn = np.diagonal(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean(axis=1)
+            prior = found.prior
+            entries[camera.name] = {
+                "used": used,
+                "reason": found.refused,
+                "pictures": len(found.position),
+                "points": found.points,
+                "reprojection_px": found.reprojection_px if used else None,
+                "rotation_sigma_deg": {
+                    "log": float(np.degrees(prior.level[1])),
+                    "background": float(np.degrees(np.sqrt(np.median(turn)))) if used else None,
+                },
+            }
             if found.frozen:
                 warnings.append(
                     f"{camera.name}: its logged position never changes, but its pictures do not show a camera"
@@ -1065,20 +1078,3 @@ def _loosened_still(loosened: Float, variance: Float) -> Float | None:
         return None
     more = np.sqrt(np.maximum(variance - np.median(variance, axis=0), 0.0))
     return np.where((loosened > 0).any(axis=1, keepdims=True), more, 0.0)
-
-
-def _entry(found: Adjusted) -> dict[str, Any]:
-    used = found.refused is None
-    turn = np.diagonal(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean(axis=1)
-    prior = found.prior
-    return {
-        "used": used,
-        "reason": found.refused,
-        "pictures": len(found.position),
-        "points": found.points,
-        "reprojection_px": found.reprojection_px if used else None,
-        "rotation_sigma_deg": {
-            "log": float(np.degrees(prior.level[1])),
-            "background": float(np.degrees(np.sqrt(np.median(turn)))) if used else None,
-        },
-    }

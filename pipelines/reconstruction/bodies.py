@@ -85,17 +85,13 @@ def _errors(
     smaller = sure & ~(np.trace(own, axis1=-2, axis2=-1) > np.trace(whole, axis1=-2, axis2=-1))
     own = np.where(smaller[..., None, None], own, whole)
     unknown = ~np.isfinite(own).all(axis=(-1, -2), keepdims=True)
-    return np.where(unknown, _UNKNOWN_M2 * np.eye(3), own), _mean_known(whole - own)
-
-
-def _mean_known(covariance: Float) -> Float:
-    """Return the mean [N, 3, 3] over the finite ones of differences [N, K, 3, 3], without negative parts."""
+    covariance = whole - own
     finite = np.asarray(np.isfinite(covariance).all(axis=(-1, -2)))
     total = np.where(finite[..., None, None], covariance, 0.0).sum(axis=1)
     mean = total / np.maximum(finite.sum(axis=1), 1)[:, None, None]
     size, axes = np.linalg.eigh((mean + np.swapaxes(mean, -1, -2)) / 2)
     found: Float = (axes * np.maximum(size, 0.0)[:, None]) @ np.swapaxes(axes, -1, -2)
-    return found
+    return np.where(unknown, _UNKNOWN_M2 * np.eye(3), own), found
 
 
 # --- one camera ----------------------------------------------------------------------------------------

@@ -409,7 +409,9 @@ def _compare(
         row[:, :, turn_b : turn_b + 3] = -cross_matrix(point - position_b[t, i]) @ rotation_b[t, i]
         row[:, :, turn_a : turn_a + 3] = -first.by_turn[i]
         spread = row @ known.covariance @ np.swapaxes(row, 1, 2) + first.covariance[i]
-        axes = _axes(normal, ray)
+        along = ray - (ray * normal).sum(axis=1, keepdims=True) * normal
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        axes = np.stack([along, np.cross(normal, along)], axis=1)
         # A height is seen beside its place on the plane, along the second camera's ray.
         onto = ray[:, :, None] * normal[:, None] / (ray * normal).sum(axis=1)[:, None, None]
         fallen = axes @ (np.eye(3) - onto)
@@ -539,13 +541,6 @@ def _run(inside: Bool) -> tuple[Int64, Int64]:
     return before + 1, after - 1
 
 
-def _axes(normal: Float, ray: Float) -> Float:
-    """Build two axes [K, 2, 3] of planes by their normals [K, 3]: away along rays [K, 3], and across them."""
-    along = ray - (ray * normal).sum(axis=1, keepdims=True) * normal
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    return np.stack([along, np.cross(normal, along)], axis=1)
-
-
 def _displacements(a: _Cuts, b: _Cuts, places: _Places, expected: Float, reach_m: Float) -> Float:
     """Find patches of stills `a` in stills `b`, about expected shifts [K, 3]; NaN where nothing is clear."""
     half = np.full(reach_m.shape, _HALF_CELLS)
@@ -649,7 +644,11 @@ def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solutio
         loss = max(_LOSS, 16.0 / 2**k)
         residual = seen - design @ errors
         square = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(spread), residual)
-        scale = (1 / _excess(square, matches))[matches.pair]
+        pair = matches.pair[matches.patch]
+        factor = np.ones(int(matches.pair.max(initial=-1)) + 1)
+        for number in np.unique(pair).tolist():
+            factor[number] = max(1.0, float(np.median(square[pair == number])) / _MEDIAN_OF_TWO)
+        scale = (1 / factor)[matches.pair]
         weight = (share * scale)[matches.patch] / (1 + square / loss**2) / _MATCH_SIGMA_M**2
         # The error of a patch's place is common to its comparisons: it is eliminated.
         by_place = _sums(back_cut @ cut * weight[:, None, None], matches.patch, len(count))
@@ -665,15 +664,6 @@ def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solutio
     agree = np.bincount(matches.patch, square < _AGREEING, len(count)) > count / 2
     own = slice(len(prior))
     return _Solution(errors[own], covariance[own, own]), agree
-
-
-def _excess(square: Float, matches: _Matches) -> Float:
-    """Compute the factor of each pair's median squared residual on the expected one, at least 1."""
-    pair = matches.pair[matches.patch]
-    factor = np.ones(int(matches.pair.max(initial=-1)) + 1)
-    for number in np.unique(pair).tolist():
-        factor[number] = max(1.0, float(np.median(square[pair == number])) / _MEDIAN_OF_TWO)
-    return factor
 
 
 # --- cameras -----------------------------------------------------------------------------------------------

@@ -56,7 +56,10 @@ def mend(log: Trajectory) -> Mended:
     loosened = np.zeros((len(log.t_ns), 2))
     counts, longest_s = np.zeros(2, dtype=np.int64), 0.0
     bridged = log
-    for kind, steps in enumerate((np.diff(log.position, axis=0), _turns(log.quaternion_xyzw))):
+    quaternion = log.quaternion_xyzw
+    turns = rotation_vector_from_quaternion(multiply(quaternion[:-1] * [-1, -1, -1, 1], quaternion[1:]))
+    turns[(quaternion[1:] == quaternion[:-1]).all(axis=1)] = 0.0
+    for kind, steps in enumerate((np.diff(log.position, axis=0), turns)):
         stretches = _frozen(log.t_ns, steps, LEAST_STEP[kind])
         away = _jumps(log.t_ns, steps, LEAST_JUMP[kind])
         counts += [len(stretches), len(away)]
@@ -71,13 +74,6 @@ def mend(log: Trajectory) -> Mended:
     if not poses:
         return Mended(log, None, 0, 0, 0, 0.0)
     return Mended(bridged, loosened, int(counts[0]), int(counts[1]), poses, longest_s)
-
-
-def _turns(quaternion: Float) -> Float:
-    """Compute the rotation vectors [N - 1, 3] from each pose to the next, exactly 0 between equal ones."""
-    turns = rotation_vector_from_quaternion(multiply(quaternion[:-1] * [-1, -1, -1, 1], quaternion[1:]))
-    turns[(quaternion[1:] == quaternion[:-1]).all(axis=1)] = 0.0
-    return np.asarray(turns)
 
 
 def _frozen(t_ns: Int64, steps: Float, least: float) -> list[tuple[int, int]]:

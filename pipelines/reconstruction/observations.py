@@ -306,7 +306,7 @@ def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tu
     """
     rays, confidence, delay_s = _chosen(camera, found, c, choice)
     if camera.intrinsics.readout_s:
-        rays = rays - _row_motion(camera, rays, delay_s)
+        rays = rays - np.nan_to_num(_velocity(camera, rays, delay_s) * delay_s[..., None])
     return rays, confidence
 
 
@@ -319,11 +319,6 @@ def readout_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> dict
     seen = int(np.isfinite(rays[..., 0]).sum())
     moved = int(np.isfinite(_velocity(camera, rays, delay_s)[..., 0])[np.isfinite(rays[..., 0])].sum())
     return {"readout_s": camera.intrinsics.readout_s, "keypoints": moved, "without_motion": seen - moved}
-
-
-def _row_motion(camera: Camera, rays: Float, delay_s: Float) -> Float:
-    """Compute how far keypoints [F, P, J, 2] move from their frame's stamp to their row's time, or 0."""
-    return np.nan_to_num(_velocity(camera, rays, delay_s) * delay_s[..., None])
 
 
 def _velocity(camera: Camera, rays: Float, delay_s: Float) -> Float:

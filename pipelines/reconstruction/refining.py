@@ -212,7 +212,12 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
         return RefinedFlight(flight.observations, flight.views, flight.result, None, metrics, warnings)
 
     observed, views = _observe_refined(refined, flight, offset_s)
-    result = _keep_reconstructed_joints(refined, views)
+    gated = triangulate(views, method="robust")
+    position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
+    ok = (gated.status == STATUS.index("ok")) & ~np.isnan(position[:, 0])
+    np.copyto(gated.points, position, where=ok[:, None])
+    np.copyto(gated.covariance, covariance, where=ok[:, None, None])
+    result = replace(gated, residual_px=reprojection_px(views, gated.points))
     poses = _camera_table(flight, refined, offset_s)
     return RefinedFlight(observed, views, result, poses, metrics, warnings)
 
@@ -430,16 +435,6 @@ def _observe_refined(refined: Refined, flight: RobustFlight, offset_s: Float) ->
     )
     views = replace(views, pixel_sigma=estimate_noise(views))
     return replace(observed, position=position, rotation=rotation), views
-
-
-def _keep_reconstructed_joints(refined: Refined, views: Views) -> Triangulation:
-    """Keep the estimate's points and covariances where `robust` reconstructs the joint from these views."""
-    gated = triangulate(views, method="robust")
-    position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
-    ok = (gated.status == STATUS.index("ok")) & ~np.isnan(position[:, 0])
-    np.copyto(gated.points, position, where=ok[:, None])
-    np.copyto(gated.covariance, covariance, where=ok[:, None, None])
-    return replace(gated, residual_px=reprojection_px(views, gated.points))
 
 
 def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:

@@ -559,7 +559,13 @@ def angles_parts(observations: Observations, views: Views, result: Triangulation
     person as a whole and hardly change an angle. `_CORRELATED` accounts for the correlation of the rest.
     """
     times, people, joints, _ = observations.confidence.shape
-    scale = _residual_scale(views, result)
+    # Root of the variance of unit weight: two residuals for each view, three unknowns for each joint-frame.
+    (ok,) = np.nonzero(result.status == _OK)
+    used = result.inlier[ok]
+    whitened = np.where(used, views.weight[ok] * result.residual_px[ok] / views.pixel_sigma, 0.0)
+    freedom = np.maximum(2 * used.sum(axis=1) - 3, 0)
+    total = int(freedom.sum())
+    scale = float(np.sqrt((whitened[freedom > 0] ** 2).sum() / total)) if total else 1.0
     names = np.array(list(ANGLES), dtype=object)
     kinds = [name.removeprefix("left_").removeprefix("right_") for name in ANGLES]
     correlated = np.array([_CORRELATED.get(kind, _CORRELATED_ELSE) for kind in kinds])
@@ -616,20 +622,6 @@ def own_covariance(views: Views, result: Triangulation, rows: slice, scale: floa
     own[sure] = scale**2 * np.linalg.inv(normal[sure])
     smaller = np.trace(own, axis1=-2, axis2=-1) < np.trace(whole, axis1=-2, axis2=-1)
     return np.where(smaller[:, None, None], own, whole)
-
-
-def _residual_scale(views: Views, result: Triangulation) -> float:
-    """Estimate the ratio of the inliers' residuals to their stated pixel noise; 1 without redundant views.
-
-    Root of the variance of unit weight: squared whitened residuals over the degrees of freedom, which are two
-    for each view and three fewer for each joint-frame.
-    """
-    (ok,) = np.nonzero(result.status == _OK)
-    used = result.inlier[ok]
-    whitened = np.where(used, views.weight[ok] * result.residual_px[ok] / views.pixel_sigma, 0.0)
-    freedom = np.maximum(2 * used.sum(axis=1) - 3, 0)
-    total = int(freedom.sum())
-    return float(np.sqrt((whitened[freedom > 0] ** 2).sum() / total)) if total else 1.0
 
 
 def gait_of(observations: Observations, result: Triangulation) -> tuple[pd.DataFrame, dict[str, Any]]:

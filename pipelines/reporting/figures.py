@@ -213,7 +213,11 @@ def draw_over_time(summary: Summary, motion: MeasuredMotion) -> Figure:
         own = percentiles(values[:, [k]], seconds, bins)[0]
         lines.append(Line(centres, own, PEOPLE[k % len(PEOPLE)], name, width=0.9))
     top = 1.08 * float(np.nanmax(high, initial=0.0)) or 1.0
-    shares, areas, base = _status_shares(seconds, motion, bins), [], np.zeros(len(centres))
+    edges = np.searchsorted(seconds, bins)
+    per_time = np.stack([(motion.status == s).sum(axis=(1, 2)) for s in range(len(STATUS))])
+    running = np.concatenate([np.zeros((len(STATUS), 1)), np.cumsum(per_time, axis=1)], axis=1)
+    counts = np.diff(running[:, edges], axis=1)
+    shares, areas, base = counts / np.maximum(counts.sum(axis=0), 1), [], np.zeros(len(centres))
     for word in summary.statuses:
         above = base + 100 * shares[STATUS.index(word)]
         areas.append(Area(bins, base, above, STATUS_COLOURS[word], STATUS_LABELS[word]))
@@ -228,15 +232,6 @@ def draw_over_time(summary: Summary, motion: MeasuredMotion) -> Figure:
     ) + _stretch_words(bins, len(motion.t_ns))
     title = f"{what.capitalize()} over time, and the status of the joints"
     return Figure("time", title, caption, panels, 3.5, heights=[2.4, 1], columns=len(STATUS))
-
-
-def _status_shares(seconds: Float, motion: MeasuredMotion, bins: Float) -> Float:
-    """Return the share of every status in each bin, [S, bins]; 0 without rows."""
-    edges = np.searchsorted(seconds, bins)
-    per_time = np.stack([(motion.status == s).sum(axis=(1, 2)) for s in range(len(STATUS))])
-    running = np.concatenate([np.zeros((len(STATUS), 1)), np.cumsum(per_time, axis=1)], axis=1)
-    counts = np.diff(running[:, edges], axis=1)
-    return np.asarray(counts / np.maximum(counts.sum(axis=0), 1))
 
 
 def _residuals(summary: Summary, residuals: Mapping[str, tuple[Float, Float]]) -> Figure:

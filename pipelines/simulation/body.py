@@ -229,7 +229,8 @@ def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
     """Put clothes, shoes and hair on a body; hair stands `hair_m` off the scalp on a body of 1.75 m."""
     unit = body.height_m / _USUAL_HEIGHT_M
     waist = body.joint[BONE["pelvis"], 2] + 0.02 * unit
-    skin, suit = _bare(body), _suit(body)
+    quads = body.quads[body.part[body.quads].min(axis=1) != PARTS.index("cloth")]
+    skin, suit = _with_values(body, triangles(quads)), _suit(body)
 
     arm, leg, above = suit.values["arm"], suit.values["leg"], suit.values["place"][:, 2]
     shirt = cut(suit, np.minimum(outfit.sleeve - arm, above - waist + 0.08 * unit))
@@ -255,11 +256,6 @@ def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
 # --- the patches that all is cut from ------------------------------------------------------------------
 
 
-def _bare(body: Undressed) -> Patch:
-    quads = body.quads[body.part[body.quads].min(axis=1) != PARTS.index("cloth")]
-    return _with_values(body, triangles(quads))
-
-
 def _suit(body: Undressed) -> Patch:
     quads = body.quads[body.part[body.quads].min(axis=1) == PARTS.index("cloth")]
     return _with_values(body, triangles(quads))
@@ -270,6 +266,13 @@ def _with_values(body: Undressed, faces: NDArray[np.intp]) -> Patch:
     x, _, z = (body.vertices - body.joint[BONE["neck"]]).T / unit
     eyes = body.vertices[body.part == PARTS.index("white")].mean(axis=0)
     ahead, _, above = (body.vertices - eyes).T / unit
+    crown = above - 0.06 + 0.25 * np.maximum(-ahead - 0.02, 0.0)
+    sides = np.minimum(-ahead - 0.045, above - 0.012)
+    back = np.minimum(-ahead - 0.112, above + 0.06)
+    draw = np.random.default_rng(0)
+    wave, phase = draw.normal(0.0, _WRINKLE_PER_M, (12, 3)), draw.uniform(0.0, 2 * np.pi, 12)
+    folds = np.sin(np.einsum("vi,ki->vk", body.vertices / unit, wave) + phase).sum(axis=1) / np.sqrt(12)
+    clipped: Float = np.clip(folds, -1.5, 1.5)
     values = {
         "place": body.vertices,
         "normal": normals(body.vertices, faces),
@@ -278,8 +281,8 @@ def _with_values(body: Undressed, faces: NDArray[np.intp]) -> Patch:
         "arm": _along_limb(body, ("upper_arm", "forearm", "hand")),
         "leg": _along_limb(body, ("thigh", "shank", "foot")),
         "below_collar": 0.012 - 0.35 * np.maximum(x - 0.02, 0.0) - z,
-        "hairy": _on_scalp(ahead, above),
-        "wrinkle": _wrinkles(body.vertices / unit),
+        "hairy": np.maximum(np.maximum(crown, sides), back),
+        "wrinkle": clipped,
         "rough": np.random.default_rng(1).normal(0.0, 1.0, len(body.vertices)),
         "sole": np.zeros(len(body.vertices)),
     }
@@ -304,23 +307,6 @@ def _share(points: Float, start: Float, end: Float) -> Float:
     way = end - start
     share: Float = np.einsum("vi,i->v", points - start, way) / np.sum(way * way)
     return share
-
-
-def _on_scalp(ahead: Float, above: Float) -> Float:
-    """Compute the distance [V] of places inside the hairline, m; negative outside of it."""
-    crown = above - 0.06 + 0.25 * np.maximum(-ahead - 0.02, 0.0)
-    sides = np.minimum(-ahead - 0.045, above - 0.012)
-    back = np.minimum(-ahead - 0.112, above + 0.06)
-    return np.maximum(np.maximum(crown, sides), back)
-
-
-def _wrinkles(vertices: Float) -> Float:
-    """Compute folds of cloth [V], -1.5..1.5: a sum of plane waves, the same for everyone."""
-    draw = np.random.default_rng(0)
-    wave, phase = draw.normal(0.0, _WRINKLE_PER_M, (12, 3)), draw.uniform(0.0, 2 * np.pi, 12)
-    folds = np.sin(np.einsum("vi,ki->vk", vertices, wave) + phase).sum(axis=1) / np.sqrt(12)
-    clipped: Float = np.clip(folds, -1.5, 1.5)
-    return clipped
 
 
 # --- layers --------------------------------------------------------------------------------------------
@@ -422,7 +408,7 @@ class PosablePerson:
         is the blend of their mass and moment by bone.
         """
         found = np.empty((len(motion.t_s), len(self.joints), 3))
-        for part in _parts_of(len(motion.t_s)):
+        for part in (slice(k, k + _FRAMES_AT_ONCE) for k in range(0, len(motion.t_s), _FRAMES_AT_ONCE)):
             matrix, translation = self.skinning.transforms(motion.root[part], motion.rotation[part])
             turned = np.einsum("tbij,kbj->tki", matrix, self.keypoint_moment)
             found[part] = turned + np.einsum("tbi,kb->tki", translation, self.keypoint_mass)
@@ -532,7 +518,3 @@ def _keypoint_parts(body: Undressed) -> tuple[Float, Float]:
     np.add.at(moment, row, by_bone[:, :, None] * body.vertices[vertex, None])
     total = mass.sum(axis=1, keepdims=True)
     return mass / total, moment / total[..., None]
-
-
-def _parts_of(count: int) -> Iterator[slice]:
-    return (slice(k, k + _FRAMES_AT_ONCE) for k in range(0, count, _FRAMES_AT_ONCE))

@@ -204,7 +204,12 @@ def _at_their_rows(
     delay_s = np.zeros(near.shape[:2])
     for _ in range(_ROW_STEPS):
         t_ns = stamps[:, None] + np.rint(1e9 * delay_s).astype(np.int64)
-        joints = np.einsum("fjik,fjk->fji", near, _lagrange(nodes_s, delay_s))
+        away = delay_s[..., None] - nodes_s
+        weights = [
+            np.prod(np.delete(away, k, axis=-1) / (nodes_s[k] - np.delete(nodes_s, k)), axis=-1)
+            for k in range(len(nodes_s))
+        ]
+        joints = np.einsum("fjik,fjk->fji", near, np.stack(weights, axis=-1))
         poses = drone.at(t_ns.ravel())
         place = poses.camera_position.reshape(*delay_s.shape, 3)
         turn = poses.camera_quaternion_xyzw.reshape(*delay_s.shape, 4)
@@ -227,16 +232,6 @@ def _during_readouts(flight: SimulatedFlight, drone: SimulatedDrone, person: Sim
     t_s = drone.at_frames.t_ns / 1e9
     at_nodes = [person.person.keypoints(person.moving(t_s + node)) for node in _nodes_s(drone.intrinsics)]
     return np.stack(at_nodes, axis=-1)
-
-
-def _lagrange(nodes: Float, at: Float) -> Float:
-    """Compute the weights [..., N] of values at the nodes [N] for the polynomial's value at places [...]."""
-    away = at[..., None] - nodes
-    weights = [
-        np.prod(np.delete(away, k, axis=-1) / (nodes[k] - np.delete(nodes, k)), axis=-1)
-        for k in range(len(nodes))
-    ]
-    return np.stack(weights, axis=-1)
 
 
 def keypoints_of(
@@ -327,7 +322,11 @@ def _person(
 def _hidden_by_person(other: SimulatedPerson, around: Float, t_ns: Int64, eye: Float, joints: Float) -> Bool:
     """Find the joints [F, J] of somebody that a person's body hides."""
     low, high = around.min(axis=(1, 3)) - _REACH_M, around.max(axis=(1, 3)) + _REACH_M
-    near = _meets_box(eye, joints, low[:, None], high[:, None])
+    way = joints - eye
+    with np.errstate(divide="ignore", invalid="ignore"):  # a line along an axis: infinite, or NaN on a face
+        sides = np.stack([(low[:, None] - eye) / way, (high[:, None] - eye) / way])
+    enter, leave = np.fmin(*sides).max(axis=-1), np.fmax(*sides).min(axis=-1)
+    near: Bool = np.fmax(enter, 0.0) <= np.fmin(leave, 1.0)
     # A global shutter takes all joints of a picture at once, a rolling one each of them at a time of its own.
     asked, targets = near.reshape(*t_ns.shape, -1), joints.reshape(*t_ns.shape, -1, 3)
     hidden = np.zeros_like(asked)
@@ -340,16 +339,6 @@ def _hidden_by_person(other: SimulatedPerson, around: Float, t_ns: Int64, eye: F
         surface, of = other.person.surface(motion.root[k], motion.rotation[k]), asked[frame, taken]
         hidden[frame, taken, of] = hidden_by(surface, eye[frame, taken], targets[frame, taken, of])
     return hidden.reshape(near.shape)
-
-
-def _meets_box(start: Float, end: Float, low: Float, high: Float) -> Bool:
-    """Test if straight lines between two points meet boxes along the axes, [..., 3] each, broadcast."""
-    way = end - start
-    with np.errstate(divide="ignore", invalid="ignore"):  # a line along an axis: infinite, or NaN on a face
-        sides = np.stack([(low - start) / way, (high - start) / way])
-    enter, leave = np.fmin(*sides).max(axis=-1), np.fmax(*sides).min(axis=-1)
-    meets: Bool = np.fmax(enter, 0.0) <= np.fmin(leave, 1.0)
-    return meets
 
 
 def _moving(

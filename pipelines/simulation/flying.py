@@ -238,7 +238,12 @@ class _Flight(NamedTuple):
         heading = _followed(
             np.arctan2(away[..., 1], away[..., 0]), self.t_s, HEADING_LAG_S, HEADING_RATE_RADPS
         )
-        body_xyzw = _leaning(self.acceleration, self.velocity, heading)
+        thrust = self.acceleration + _DRAG_PER_S * self.velocity
+        lift = np.maximum(thrust[..., 2] + _GRAVITY_MPS2, _LEAST_LIFT * _GRAVITY_MPS2)
+        up = _unit(np.concatenate([thrust[..., :2], lift[..., None]], axis=-1))
+        level_left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], axis=-1)
+        forward = _unit(np.cross(level_left, up))
+        body_xyzw = quaternion_from_matrix(np.stack([forward, np.cross(up, forward), up], axis=-1))
         sight = away - rotate(body_xyzw, np.array(LEVER_ARM))
         pan = np.arctan2(sight[..., 1], sight[..., 0])
         down = np.arctan2(-sight[..., 2], np.hypot(sight[..., 0], sight[..., 1]))
@@ -248,16 +253,6 @@ class _Flight(NamedTuple):
         )
         camera_xyzw = multiply(gimbal, body_from_camera("forward"))
         return DronePaths(self.t_s, self.position, self.velocity, body_xyzw, camera_xyzw)
-
-
-def _leaning(acceleration: Float, velocity: Float, heading: Float) -> Float:
-    """Compute world_from_body [..., 4] of multirotors: up along the thrust, the nose above the heading."""
-    thrust = acceleration + _DRAG_PER_S * velocity
-    lift = np.maximum(thrust[..., 2] + _GRAVITY_MPS2, _LEAST_LIFT * _GRAVITY_MPS2)
-    up = _unit(np.concatenate([thrust[..., :2], lift[..., None]], axis=-1))
-    level_left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], axis=-1)
-    forward = _unit(np.cross(level_left, up))
-    return quaternion_from_matrix(np.stack([forward, np.cross(up, forward), up], axis=-1))
 
 
 def _followed(angle: Float, t_s: Float, lag_s: float, fastest_radps: float) -> Float:

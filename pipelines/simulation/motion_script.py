@@ -76,7 +76,10 @@ def foot_over_time(
     # Uphill the heel behind rises as much more as the ground is steep.
     pitch -= keys.at("leaves", t_s) * np.arctan((rise + np.hypot(rise, 0.02)) / 2)
 
-    bend = curve["bent"] * _bent_toes(pitch)
+    raised = np.maximum(-pitch, 0.0)
+    # x / (1 + x^8)^(1/8): as good as x below three quarters of the limit.
+    part = raised / _TOES_BEND
+    bend = curve["bent"] * raised / (1 + part**8) ** 0.125
     ankle_xz = _rolled(joint, heel, tip, pitch, bend, curve["soft"])
     ankle_xz[:, 1] += curve["clear"]
 
@@ -183,14 +186,6 @@ def _swing(keys: Keys, lift_s: float, strike_s: float, rolled: Roll) -> None:
         keys.add(name, *((lift_s + share * (strike_s - lift_s), value) for share, value in curve))
 
 
-def _bent_toes(pitch: Float) -> Float:
-    """Compute the bend of toes that lie on the ground, [T] rad: all of the pitch, up to a limit."""
-    raised = np.maximum(-pitch, 0.0)
-    # x / (1 + x^8)^(1/8): as good as x below three quarters of the limit.
-    part = raised / _TOES_BEND
-    return np.asarray(raised / (1 + part**8) ** 0.125, dtype=np.float64)
-
-
 def _turned(point: Float, pitch: Float) -> Float:
     """Turn a point of the foot, pitched toes up by [T] rad: [T, 2] forward and up."""
     cosine, sine = np.cos(pitch), np.sin(pitch)
@@ -282,7 +277,9 @@ def pelvis_height(
         bound = (
             foot.ankle[:, 2] + above - hip[:, 2] + _HANGS_FREE_M * (1 - foot.carries) + 2 * foot.kicks * first
         )
-        height = _lower(height, bound, softness_m)
+        # The smaller one, a parabola where they are within `softness_m`: never above either.
+        near = np.maximum(softness_m - np.abs(height - bound), 0.0) / softness_m
+        height = np.minimum(height, bound) - near**2 * softness_m / 4
     return height
 
 
@@ -301,12 +298,6 @@ def leg_rotations(rig: Rig, root: Float, pelvis: Float, feet: Sequence[Foot]) ->
 
 def _length(rig: Rig, bone: str) -> float:
     return float(np.sqrt(np.sum(rig.offset[BONE[bone]] ** 2)))
-
-
-def _lower(one: Float, other: Float, softness_m: Float) -> Float:
-    """Return the smaller one, a parabola where they are within `softness_m`: never above either."""
-    near = np.maximum(softness_m - np.abs(one - other), 0.0) / softness_m
-    return np.asarray(np.minimum(one, other) - near**2 * softness_m / 4, dtype=np.float64)
 
 
 # --- bones ---------------------------------------------------------------------------------------------

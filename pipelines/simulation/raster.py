@@ -176,7 +176,8 @@ def projected(
     Vertices [V, 3] and the position [3] are in m, world; `world_from_camera` is a rotation [3, 3].
     """
     pinhole = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
-    points = _in_camera(vertices, position, world_from_camera)
+    x, y, z = (vertices - position).T[..., None]
+    points: Float = x * world_from_camera[0] + y * world_from_camera[1] + z * world_from_camera[2]
     corners, source = _clipped(points, faces, pinhole, float(intrinsics.width), float(intrinsics.height))
     return Projected(corners, source)
 
@@ -260,12 +261,6 @@ def draw(triangles: Projected, chosen: Int32, shifts_px: Float, first_sample_row
                 if value > nearness[row, column + np.uint64(k)]:
                     nearness[row, column + np.uint64(k)] = value
                     seen[row, column + np.uint64(k)] = face
-
-
-def _in_camera(vertices: Float, position: Float, world_from_camera: Float) -> Float:
-    x, y, z = (vertices - position).T[..., None]
-    points: Float = x * world_from_camera[0] + y * world_from_camera[1] + z * world_from_camera[2]
-    return points
 
 
 @cached

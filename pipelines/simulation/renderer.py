@@ -135,9 +135,11 @@ def ground_texture(seed: int) -> GroundTexture:
     whole = [np.rint(np.clip(level * (255 / FULL_SCALE), 0, 255)).astype(np.uint32) for level in levels]
     texels = [level[..., 0] | level[..., 1] << 8 | level[..., 2] << 16 for level in whole]
     first = np.cumsum([0, *(level.shape[0] ** 2 for level in levels[:-1])])
-    return GroundTexture(
-        np.concatenate([level.ravel() for level in texels]), first.astype(np.int64), _site(rng)
-    )
+    lush, dry = _noise(rng, SITE_TEXELS, 2.4), _noise(rng, SITE_TEXELS, 3.0)
+    light = 1.0 + 0.09 * lush
+    site = np.stack([light + 0.09 * dry, light + 0.02 * dry, light - 0.05 * dry], axis=-1)
+    clipped: Float32 = np.clip(site / site.mean(axis=(0, 1)), 0.4, 1.8).astype(np.float32)
+    return GroundTexture(np.concatenate([level.ravel() for level in texels]), first.astype(np.int64), clipped)
 
 
 def paint(texture: GroundTexture, fragments: Fragments, count: int, view: CameraView) -> None:
@@ -250,14 +252,6 @@ def _tile(rng: np.random.Generator) -> Float32:
     tile *= np.clip(1.0 + 0.10 * clumps, 0.5, 1.5)[..., None].astype(np.float32)
     normalised: Float32 = tile / tile.mean(axis=(0, 1))
     return normalised
-
-
-def _site(rng: np.random.Generator) -> Float32:
-    lush, dry = _noise(rng, SITE_TEXELS, 2.4), _noise(rng, SITE_TEXELS, 3.0)
-    light = 1.0 + 0.09 * lush
-    site = np.stack([light + 0.09 * dry, light + 0.02 * dry, light - 0.05 * dry], axis=-1)
-    clipped: Float32 = np.clip(site / site.mean(axis=(0, 1)), 0.4, 1.8).astype(np.float32)
-    return clipped
 
 
 def _noise(rng: np.random.Generator, n: int, slope: float) -> Float:
@@ -414,14 +408,9 @@ def exposed_moments(rows: int, *, exposure_s: float, readout_s: float) -> tuple[
     moments = (np.arange(steps + 1) / steps - 0.5) * (exposure_s + readout_s)
     middle = (np.arange(rows) / max(rows - 1, 1) - 0.5) * readout_s
     if not exposure_s:
-        return moments, _between(moments, middle)
+        return moments, np.stack([np.interp(middle, moments, one) for one in np.eye(len(moments))])
     whole = _integral(moments, middle + exposure_s / 2) - _integral(moments, middle - exposure_s / 2)
     return moments, whole / exposure_s
-
-
-def _between(moments: Float, at: Float) -> Float:
-    """Compute weights [K, N] of linear interpolation between moments [K] at times [N] within them."""
-    return np.stack([np.interp(at, moments, one) for one in np.eye(len(moments))])
 
 
 def _integral(moments: Float, until: Float) -> Float:

@@ -70,7 +70,7 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
         f"{side}_{below}"
         for side in SIDES
         for below, above in _LIMB_ABOVE.items()
-        if not missing and not _hangs_on(source, found[f"{side}_{below}"], found[f"{side}_{above}"])
+        if not missing and not (found[f"{side}_{above}"] in _above(source, found[f"{side}_{below}"]))
     ]
     if missing:
         problem = f"found no {', '.join(missing)} among its bones {', '.join(source.bones)}"
@@ -117,10 +117,6 @@ def _above(source: SkeletalMotion, bone: int) -> list[int]:
     while (bone := source.parent[bone]) >= 0:
         chain.append(bone)
     return chain
-
-
-def _hangs_on(source: SkeletalMotion, bone: int, other: int) -> bool:
-    return other in _above(source, bone)
 
 
 def _trunk(source: SkeletalMotion, found: dict[str, int]) -> None:

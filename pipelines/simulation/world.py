@@ -134,24 +134,18 @@ def _corners(ground: scenario.GroundSquare, terrain: MoundedGround, whole_m: flo
     found = []
     while len(cells):
         centre = (cells + side / 2) * finest_m - whole_m / 2
-        split = _too_wide(centre, side * finest_m, ground, terrain) & (side > 1)
+        side_m = side * finest_m
+        outside = np.abs(centre).max(axis=1) - side_m / 2 - ground.size_m / 2
+        allowed = np.maximum(1.001 * ground.size_m / _CELLS, _GROWTH * outside)
+        # Triangles join corners of neighbouring cells, too: look a cell further.
+        curvature = terrain.curvature_within(centre + np.array(ground.centre), side_m * 1.5)
+        wide: NDArray[np.bool_] = (side_m > allowed) | (curvature * side_m**2 / 4 > _FLATNESS_M)
+        split = wide & (side > 1)
         steps = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
         found.append((cells[~split][:, None] + steps * side).reshape(-1, 2))
         side //= 2
         cells = (cells[split][:, None] + steps * side).reshape(-1, 2)
     return np.unique(np.concatenate(found), axis=0), finest_m
-
-
-def _too_wide(
-    centre: Float, side_m: float, ground: scenario.GroundSquare, terrain: MoundedGround
-) -> NDArray[np.bool_]:
-    """Find the cells [N] to be halved; centres [N, 2] are relative to the ground's middle."""
-    outside = np.abs(centre).max(axis=1) - side_m / 2 - ground.size_m / 2
-    allowed = np.maximum(1.001 * ground.size_m / _CELLS, _GROWTH * outside)
-    # Triangles join corners of neighbouring cells, too: look a cell further.
-    curvature = terrain.curvature_within(centre + np.array(ground.centre), side_m * 1.5)
-    wide: NDArray[np.bool_] = (side_m > allowed) | (curvature * side_m**2 / 4 > _FLATNESS_M)
-    return wide
 
 
 # A wood that has no room after so many tries is too dense.
@@ -180,7 +174,18 @@ def plant(
     for planted in range(wood.count):
         for _ in range(_TRIES):
             tree = _seedling(wood, rng)
-            if _has_room(tree, wood.clear_m, keep_clear, trees, walls):
+            x, y = tree.position
+            if (
+                all(
+                    math.hypot(x - other.position[0], y - other.position[1])
+                    >= _APART * max(tree.crown_radius_m, other.crown_radius_m)
+                    for other in trees
+                )
+                and all(
+                    _away_from(wall, x, y) >= wall.thickness_m / 2 + 0.1 * tree.height_m for wall in walls
+                )
+                and bool((np.hypot(keep_clear[:, 0] - x, keep_clear[:, 1] - y) >= wood.clear_m).all())
+            ):
                 trees.append(tree)
                 break
         else:
@@ -204,25 +209,6 @@ def _seedling(wood: scenario.Wood, rng: np.random.Generator) -> scenario.Tree:
     ]
     radius = height * (_SLENDER + (_STOUT - _SLENDER) * girth)
     return scenario.Tree.model_construct(position=place, height_m=height, crown_radius_m=radius)
-
-
-def _has_room(
-    tree: scenario.Tree,
-    clear_m: float,
-    keep_clear: Float,
-    trees: Sequence[scenario.Tree],
-    walls: Sequence[scenario.Wall],
-) -> bool:
-    x, y = tree.position
-    return (
-        all(
-            math.hypot(x - other.position[0], y - other.position[1])
-            >= _APART * max(tree.crown_radius_m, other.crown_radius_m)
-            for other in trees
-        )
-        and all(_away_from(wall, x, y) >= wall.thickness_m / 2 + 0.1 * tree.height_m for wall in walls)
-        and bool((np.hypot(keep_clear[:, 0] - x, keep_clear[:, 1] - y) >= clear_m).all())
-    )
 
 
 def _away_from(wall: scenario.Wall, x: float, y: float) -> float:
