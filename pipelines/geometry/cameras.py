@@ -31,8 +31,7 @@ def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
         normalised = points_camera[..., :2] / depth[..., None]
         normalised = np.where(np.isfinite(normalised).all(axis=-1, keepdims=True), normalised, np.nan)
         distorted = _DISTORT[intrinsics.model](normalised, intrinsics.distortion)
-    pixels: Float = distorted * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
-    return pixels
+    return distorted * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
 
 
 def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
@@ -54,8 +53,7 @@ def row_delay_s(row_px: Float, intrinsics: Intrinsics) -> Float:
 
     `row_px` [...] counts from the centre of the first row, which is read first; NaN stays.
     """
-    delay: Float = (row_px / max(intrinsics.height - 1, 1) - 0.5) * intrinsics.readout_s
-    return delay
+    return (row_px / max(intrinsics.height - 1, 1) - 0.5) * intrinsics.readout_s
 
 
 def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
@@ -187,8 +185,7 @@ def _radtan_holds(
     """Test if the model has not folded at points: inside its limit, with a positive definite Jacobian."""
     xx, xy, yy = jacobian
     inside = np.hypot(normalised[..., 0], normalised[..., 1]) < _radtan_limit(coefficients)
-    holds: Bool = inside & (xx * yy - xy * xy > 0) & (xx + yy > 0)
-    return holds
+    return inside & (xx * yy - xy * xy > 0) & (xx + yy > 0)
 
 
 def _radtan_gain(square: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:

@@ -63,8 +63,7 @@ def place_at(enu: Float, origin: Place) -> Place:
 def enu_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Float, origin: Place) -> Float:
     """Compute metres [..., 3] east, north and up of a place for points on Earth; arguments broadcast."""
     from_centre = ecef_from_geodetic(latitude_deg, longitude_deg, altitude_m) - _ecef_of(origin)
-    turned: Float = from_centre @ _enu_axes(origin).T
-    return turned
+    return from_centre @ _enu_axes(origin).T
 
 
 def enu_from_enu(of: Place, origin: Place) -> tuple[Float, Float]:

@@ -313,12 +313,10 @@ def _unit(vector: Float) -> Float:
 
 def _across(vector: Float, axis: Float) -> Float:
     """Return the part of a vector that is perpendicular to a unit axis."""
-    part: Float = vector - _dot(vector, axis) * axis
-    return part
+    return vector - _dot(vector, axis) * axis
 
 
 def _bend(one: Float, other: Float) -> Float:
     """Return the angle between two vectors, 0 to pi."""
     across = _cross(one, other)
-    angle: Float = np.arctan2(np.sqrt(_dot(across, across)), _dot(one, other))
-    return angle
+    return np.arctan2(np.sqrt(_dot(across, across)), _dot(one, other))

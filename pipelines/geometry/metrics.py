@@ -365,8 +365,7 @@ class Alignment:
     def apply(self, points: Float) -> Float:
         """Move points [..., J, 3] of the source onto the target."""
         turned = points @ np.swapaxes(self.rotation, -1, -2)
-        moved: Float = self.scale[..., None, None] * turned + self.translation[..., None, :]
-        return moved
+        return self.scale[..., None, None] * turned + self.translation[..., None, :]
 
 
 def align_each(source: Float, target: Float, *, with_scale: bool) -> Alignment:

@@ -84,8 +84,7 @@ class _RandomProcess(NoiseModel):
         turn_rate_radps: Float,  # noqa: ARG002
     ) -> Float:
         """Compute `NoiseModel.marginal_sigma`; motion has no influence."""
-        sigma: Float = self._unit_sigma(elapsed_s)[:, None] * self._scale()
-        return sigma
+        return self._unit_sigma(elapsed_s)[:, None] * self._scale()
 
     def errors(
         self,

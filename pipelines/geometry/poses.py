@@ -82,8 +82,7 @@ def rotate(quaternion_xyzw: Float, vectors: Float) -> Float:
     """Rotate vectors [..., 3] by quaternions [..., 4], broadcast."""
     axis, w = quaternion_xyzw[..., :3], quaternion_xyzw[..., 3:]
     twice = 2 * np.cross(axis, vectors)
-    rotated: Float = vectors + w * twice + np.cross(axis, twice)
-    return rotated
+    return vectors + w * twice + np.cross(axis, twice)
 
 
 def quaternion_from_rotation_vector(rotation_vector: Float) -> Float:
@@ -330,8 +329,7 @@ def cross_matrix(vector: Float) -> Float:
 
 
 def _propagated(jacobian: Float, covariance: Float) -> Float:
-    carried: Float = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
-    return carried
+    return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
 
 
 # --- a log's tree of transforms --------------------------------------------------------------------------

@@ -247,8 +247,7 @@ def _midpoints(direction: Float, centre: Float, weight: Float, wanted: Bool) -> 
     across = weight[..., None, None] * (np.eye(3) - direction[..., :, None] * direction[..., None, :])
     normal = np.where(wanted[:, None, None], across.sum(axis=1), np.eye(3))
     right = (across @ centre[..., None]).sum(axis=1)
-    points: Float = np.linalg.solve(_closed(normal), right)[..., 0]
-    return points
+    return np.linalg.solve(_closed(normal), right)[..., 0]
 
 
 def _closed(normal: Float) -> Float:
@@ -256,8 +255,7 @@ def _closed(normal: Float) -> Float:
     trace = np.maximum(np.trace(normal, axis1=1, axis2=2), np.finfo(float).tiny ** 0.5)
     is_open = np.linalg.det(normal / trace[:, None, None]) <= 3.0 * np.finfo(float).eps
     more = np.where(is_open, _LEAST_INFORMATION * trace, 0.0)[:, None, None] * np.eye(3)
-    closed: Float = np.asarray(normal + more)
-    return closed
+    return np.asarray(normal + more)
 
 
 def _image_covariance(views: Views, rays: Float, weight: Float) -> tuple[Float, Float]:
@@ -329,8 +327,7 @@ def reprojection_px(views: Views, points: Float) -> Float:
     depth = np.where(z > 0, z, 1.0)
     distance = views.focal * np.hypot(x / depth - views.rays[..., 0], y / depth - views.rays[..., 1])
     seen = (views.weight > 0) & np.isfinite(distance + z)
-    result: Float = np.where(seen, np.where(z > 0, distance, np.inf), np.nan)
-    return result
+    return np.where(seen, np.where(z > 0, distance, np.inf), np.nan)
 
 
 def estimate_noise(views: Views) -> Float:

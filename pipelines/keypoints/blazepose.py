@@ -356,5 +356,4 @@ def _refined(in_crop: Float, heatmap: NDArray[np.floating[Any]]) -> tuple[Float,
 
 def _sigmoid(logit: NDArray[np.floating[Any]]) -> Float:
     # Beyond 60 nothing changes but the overflow warning.
-    sigmoid: Float = 1 / (1 + np.exp(-np.clip(logit.astype(np.float64), -60, 60)))
-    return sigmoid
+    return 1 / (1 + np.exp(-np.clip(logit.astype(np.float64), -60, 60)))

@@ -248,8 +248,7 @@ class _JointPlanner(_TeamPlanner):
     def _beside(self, values: Float) -> Float:
         """Return the mean of values [T, S] at the two neighbouring yaws."""
         by_yaw = values.reshape(len(values), self._yaws, -1)
-        mean: Float = ((np.roll(by_yaw, 1, axis=1) + np.roll(by_yaw, -1, axis=1)) / 2.0).reshape(values.shape)
-        return mean
+        return ((np.roll(by_yaw, 1, axis=1) + np.roll(by_yaw, -1, axis=1)) / 2.0).reshape(values.shape)
 
 
 def _in_a_turn(drones: int) -> int:

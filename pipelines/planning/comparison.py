@@ -283,8 +283,7 @@ def _difference(
 
 
 def _tilt_deg(scene: ReplayScene, flown: ArmFlight) -> Float:
-    tilt_deg: Float = np.degrees(slot_of(flown.position - aimed_at(scene, flown))[..., TILT])
-    return tilt_deg
+    return np.degrees(slot_of(flown.position - aimed_at(scene, flown))[..., TILT])
 
 
 def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]:

@@ -71,8 +71,7 @@ def slot_of(offset: Float) -> Float:
 
 def wrapped(angle_rad: Float) -> Float:
     """Wrap angles to -pi..pi, half open."""
-    within: Float = (angle_rad + np.pi) % (2 * np.pi) - np.pi
-    return within
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 def yaw_set(yaws: int, start_rad: float) -> Float:

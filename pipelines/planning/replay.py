@@ -369,8 +369,7 @@ def seen_people(scene: ReplayScene, flown: ArmFlight) -> Bool:
 def looks_rad(flown: ArmFlight) -> Float:
     """Compute the yaw [N, T] of the optical axes from east."""
     axis = matrix_from_quaternion(flown.quaternion_xyzw)[..., 2]
-    yaw: Float = np.arctan2(axis[..., 1], axis[..., 0])
-    return yaw
+    return np.arctan2(axis[..., 1], axis[..., 0])
 
 
 def _estimates(scene: ReplayScene) -> Float:

@@ -531,8 +531,7 @@ class ReplayScene:
     @cached_property
     def actor(self) -> Float:
         """Reference of the scores [T, 3]: the actor, of several people their weighted middle."""
-        middle: Float = np.tensordot(self.weights, self.people, 1)
-        return middle
+        return np.tensordot(self.weights, self.people, 1)
 
     @property
     def t_s(self) -> Float:

@@ -81,8 +81,7 @@ def predicted_error(information: Float) -> Float:
 
 def log_determinant(information: Float) -> Float:
     """Compute the logarithm of the determinant of positive definite [..., 3, 3]."""
-    logarithm: Float = np.log(_minors(information)[1])
-    return logarithm
+    return np.log(_minors(information)[1])
 
 
 def _minors(matrix: Float) -> tuple[Float, Float]:
@@ -133,8 +132,7 @@ def in_view(camera: Float, looks_rad: Float, person: Float, fov_rad: float) -> B
     """Test [...] if people [..., 3] are in the level field of view of cameras [..., 3] with yaws [...]."""
     offset = person - camera
     aside = wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - looks_rad)
-    inside: Bool = np.abs(aside) <= fov_rad / 2.0
-    return inside
+    return np.abs(aside) <= fov_rad / 2.0
 
 
 def score(

@@ -191,8 +191,7 @@ class PosePrior:
         """Standard deviation of all parts together [2] (m, rad), slow ones over some seconds."""
         slow = [process.sigma0**2 + process.rate**2 * _SLOW_S for process in self.slow]
         constant = np.square([np.hypot(self.constant[0], self.constant[2]), self.constant[1]])
-        level: Float = np.sqrt(np.square(self.white) + constant + slow)
-        return level
+        return np.sqrt(np.square(self.white) + constant + slow)
 
     def covariance(self, times: int) -> Float:
         """Return the covariance [times, 6, 6] of the logged poses."""

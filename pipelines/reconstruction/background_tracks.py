@@ -188,8 +188,7 @@ def people_boxes(camera: Camera) -> Float:
     if not len(known):
         return boxes
     last = np.clip(np.searchsorted(known, np.arange(frames), side="right") - 1, 0, None)
-    filled: Float = boxes[known[last]]
-    return filled
+    return boxes[known[last]]
 
 
 class Follower:

@@ -597,8 +597,7 @@ def _fit_poses(
 
 def _carried(slope: Float, covariance: Float) -> Float:
     """Carry the covariance [G, G] of shared unknowns through slopes [N, B, 3, G]."""
-    found: Float = (slope @ covariance) @ np.swapaxes(slope, -1, -2)
-    return found
+    return (slope @ covariance) @ np.swapaxes(slope, -1, -2)
 
 
 # --- first poses ---------------------------------------------------------------------------------------
@@ -667,5 +666,4 @@ def _axes(first: Float, second: Float) -> Float:
 def _unit(vector: Float) -> Float:
     """Scale vectors [..., 3] to length 1; NaN for zero."""
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
-    found: Float = vector / np.where(length > 1e-9, length, np.nan)
-    return found
+    return vector / np.where(length > 1e-9, length, np.nan)

@@ -315,5 +315,4 @@ def _miss(t_s: Float, position: Float, there: Bool, missing: int) -> Float | Non
 def _interpolated(t_s: Float, position: Float, at_s: Float) -> Float:
     from scipy.interpolate import PchipInterpolator
 
-    between: Float = PchipInterpolator(t_s, position, axis=0)(at_s)
-    return between
+    return PchipInterpolator(t_s, position, axis=0)(at_s)

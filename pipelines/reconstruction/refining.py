@@ -379,8 +379,7 @@ def _undetermined_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: F
 
 def _unsettled(refined: Refined) -> Bool:
     """Test which clocks [C] the estimate moved by more than counts."""
-    unsettled: Bool = np.abs(refined.clock_offset_s) > np.maximum(SETTLED_S, refined.clock_sigma_s)
-    return unsettled
+    return np.abs(refined.clock_offset_s) > np.maximum(SETTLED_S, refined.clock_sigma_s)
 
 
 def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:

@@ -671,8 +671,7 @@ def poses_table(cameras: Sequence[Camera], poses: Sequence[tuple[Float, Float]])
 def _row_mean(values: Float) -> Float:
     """Compute the mean of each row without its NaN; NaN for a row of only NaN."""
     count = (~np.isnan(values)).sum(axis=1)
-    mean: Float = np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
-    return mean
+    return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
 
 
 # Mean error over the root mean square that the covariances predict: quantiles 0.1, 0.5 and 0.9 over 180

@@ -279,8 +279,7 @@ def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
     """Write rows by column; columns in which no row has anything are left out."""
     numbers = pd.DataFrame(rows).dropna(axis="columns", how="all")
     texts = numbers.select_dtypes(exclude="number").map(cell_text)
-    written: str = numbers.assign(**texts).to_csv(index=False, float_format="%.9g", lineterminator="\n")
-    return written
+    return numbers.assign(**texts).to_csv(index=False, float_format="%.9g", lineterminator="\n")
 
 
 def _rows_of(panel: Panel) -> Iterator[dict[str, object]]:
@@ -595,8 +594,7 @@ def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
     """Return the edges of at most so many bins; one per stamp if there are fewer stamps."""
     count = min(len(seconds), most)
     step = (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1) or 1.0
-    edges: Float = np.linspace(seconds[0] - step / 2, seconds[-1] + step / 2, count + 1)
-    return edges
+    return np.linspace(seconds[0] - step / 2, seconds[-1] + step / 2, count + 1)
 
 
 def percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Float, Float]:

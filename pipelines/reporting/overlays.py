@@ -362,8 +362,7 @@ def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens
         for axis in np.eye(3)
     ]
     derivative = np.stack(columns, axis=-1) @ np.swapaxes(world_from_camera, -1, -2)
-    spread: Float = derivative @ full_covariance(covariance) @ np.swapaxes(derivative, -1, -2)
-    return spread
+    return derivative @ full_covariance(covariance) @ np.swapaxes(derivative, -1, -2)
 
 
 def _view(

@@ -338,8 +338,7 @@ def window_of(view: OverlayView) -> Window:
 def _within(points: Float, size: tuple[int, int]) -> Float:
     """Return the known points [N, 2] that lie in the picture."""
     flat = points.reshape(-1, 2)
-    kept: Float = flat[(flat >= 0).all(axis=1) & (flat < size).all(axis=1)]  # False for NaN
-    return kept
+    return flat[(flat >= 0).all(axis=1) & (flat < size).all(axis=1)]  # False for NaN
 
 
 def cut_out(picture: Picture, size: tuple[int, int], window: Window, px: int, ground: int = 0) -> Picture:

@@ -7,7 +7,6 @@ millimetres from joint centres. They are of the bare body: the same in every out
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np

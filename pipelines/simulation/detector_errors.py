@@ -217,7 +217,4 @@ def _exchanged(values: Float, swapped: Bool, joints: tuple[str, ...]) -> Float:
     mirror = [
         joints.index(mirrored(name)) if mirrored(name) in joints else j for j, name in enumerate(joints)
     ]
-    exchanged: Float = np.where(
-        swapped.reshape(*swapped.shape, *(1,) * (values.ndim - 2)), values[:, mirror], values
-    )
-    return exchanged
+    return np.where(swapped.reshape(*swapped.shape, *(1,) * (values.ndim - 2)), values[:, mirror], values)

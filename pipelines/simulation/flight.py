@@ -98,8 +98,7 @@ class SimulatedFlight:
 
     def moments_of(self, drone: SimulatedDrone) -> Int64:
         """The rows [F] of `t_ns` at which a drone took its pictures."""
-        rows: Int64 = np.searchsorted(self.t_ns, drone.at_frames.t_ns)
-        return rows
+        return np.searchsorted(self.t_ns, drone.at_frames.t_ns)
 
 
 @dataclass(frozen=True)
@@ -169,8 +168,7 @@ def fly_scenario(
 def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
     """Return the stamps [F] of a drone's pictures by its own camera's clock, ns since the epoch."""
     offset_ns = round(drone.clock_offset_s * 1e9)
-    stamps: Int64 = drone.at_frames.t_ns + flight.scenario.start_ns - offset_ns
-    return stamps
+    return drone.at_frames.t_ns + flight.scenario.start_ns - offset_ns
 
 
 def visible_joints(

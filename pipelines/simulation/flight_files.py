@@ -81,8 +81,7 @@ def write_alphapose(path: Path, people: Iterable[TrackedKeypoints]) -> None:
 
 
 def _frames_with(person: TrackedKeypoints) -> list[int]:
-    frames: list[int] = np.flatnonzero(np.isfinite(person.xy).all(axis=-1).any(axis=-1)).tolist()
-    return frames
+    return np.flatnonzero(np.isfinite(person.xy).all(axis=-1).any(axis=-1)).tolist()
 
 
 def _alphapose_entry(frame: int, person: TrackedKeypoints) -> dict[str, object]:

@@ -493,8 +493,7 @@ def estimate_actor(
 
 
 def _nanoseconds(t_s: Float) -> Int64:
-    t_ns: Int64 = np.rint(t_s * 1e9).astype(np.int64)
-    return t_ns
+    return np.rint(t_s * 1e9).astype(np.int64)
 
 
 def _hermite(grid_ns: Int64, position: Float, velocity: Float, t_ns: Int64) -> Float:
@@ -508,5 +507,4 @@ def _hermite(grid_ns: Int64, position: Float, velocity: Float, t_ns: Int64) -> F
     bend_after = span_s * velocity[before + 1] * u**2 * (1 - u)
     blend = u**2 * (3 - 2 * u)
     start, end = position[before], position[before + 1]
-    points: Float = start + blend * (end - start) + bend_before - bend_after
-    return points
+    return start + blend * (end - start) + bend_before - bend_after

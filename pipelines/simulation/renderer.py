@@ -315,10 +315,9 @@ def _rays(intrinsics: Intrinsics) -> Float:
     solved = undistort(np.stack([x, y], axis=-1), intrinsics)
     if np.isnan(solved).any():
         raise ValueError(f"no ray reaches some pixels with the distortion {list(intrinsics.distortion)}")
-    rays: Float = np.stack(
+    return np.stack(
         [RectBivariateSpline(down, right, solved[..., axis])(rows, columns) for axis in range(2)], axis=-1
     )
-    return rays
 
 
 # Light is multiplied by this before the tone curve.

@@ -70,7 +70,7 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
         f"{side}_{below}"
         for side in SIDES
         for below, above in _LIMB_ABOVE.items()
-        if not missing and not (found[f"{side}_{above}"] in _above(source, found[f"{side}_{below}"]))
+        if not missing and found[f"{side}_{above}"] not in _above(source, found[f"{side}_{below}"])
     ]
     if missing:
         problem = f"found no {', '.join(missing)} among its bones {', '.join(source.bones)}"

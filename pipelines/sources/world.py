@@ -108,8 +108,7 @@ def moved(
 def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
     """Convert a log's own times to world times [N]; its drift counts from `since_ns`."""
     drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
-    world_ns: Int64 = t_ns + drift_ns + clock.offset_ns
-    return world_ns
+    return t_ns + drift_ns + clock.offset_ns
 
 
 def in_enu(trajectory: Trajectory, axes: Axes, *, of_body: bool = False) -> Trajectory:

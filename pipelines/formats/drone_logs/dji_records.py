@@ -128,8 +128,7 @@ class _Record:
     @property
     def placed(self) -> Bool:
         """[N] True for a position on Earth."""
-        known: Bool = np.isfinite(self.columns["latitude"]) & np.isfinite(self.columns["longitude"])
-        return known
+        return np.isfinite(self.columns["latitude"]) & np.isfinite(self.columns["longitude"])
 
     @property
     def clock(self) -> str:

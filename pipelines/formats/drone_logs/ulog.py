@@ -304,8 +304,7 @@ class UlogTopic:
         """Return stamps [N] since boot: the time of sampling if the log has it, else of publishing."""
         published = np.asarray(self.columns["timestamp"]).astype(np.int64)
         sampled = np.asarray(self.columns.get("timestamp_sample", published)).astype(np.int64)
-        stamps: Int64 = np.where(sampled > 0, sampled, published) * 1000
-        return stamps
+        return np.where(sampled > 0, sampled, published) * 1000
 
 
 def read_topics(path: Path, wanted: Collection[str]) -> list[UlogTopic]:

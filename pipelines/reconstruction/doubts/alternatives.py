@@ -145,10 +145,9 @@ class Trial:
 
 def turn_about(axis: str, degrees: float) -> Float:
     """Return the rotation [3, 3] about an axis."""
-    matrix: Float = matrix_from_quaternion(
+    return matrix_from_quaternion(
         quaternion_from_rotation_vector(np.radians(degrees) * np.eye(3)["xyz".index(axis)])
     )
-    return matrix
 
 
 # --- times -----------------------------------------------------------------------------------------------

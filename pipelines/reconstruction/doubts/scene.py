@@ -179,8 +179,7 @@ def _most_seen(camera: Camera) -> Int64:
     rank = np.empty(len(number), dtype=np.intp)
     rank[np.argsort(-count, kind="stable")] = np.arange(len(number))
     order = np.lexsort((rank[np.searchsorted(number, found.person)], found.frame))
-    first: Int64 = order[np.unique(found.frame[order], return_index=True)[1]]
-    return first
+    return order[np.unique(found.frame[order], return_index=True)[1]]
 
 
 def _chosen(camera: Camera, of_frame: Int64) -> Int64:
@@ -419,8 +418,7 @@ def trunk_direction(joints: Float) -> Float:
     trunk = body.shoulders - body.hips
     trunk = trunk / np.linalg.norm(trunk, axis=-1, keepdims=True)
     known = trunk[np.isfinite(trunk).all(axis=-1)]
-    mean: Float = known.mean(axis=0) if len(known) > _FEWEST_MOMENTS else np.full(3, np.nan)
-    return mean
+    return known.mean(axis=0) if len(known) > _FEWEST_MOMENTS else np.full(3, np.nan)
 
 
 class Body:
@@ -436,8 +434,7 @@ class Body:
         self.cosine: Float = upwards[:, 2] / np.linalg.norm(upwards, axis=-1)
 
     def __getitem__(self, name: str) -> Float:
-        joint: Float = self.joints[:, _INDEX[name]]
-        return joint
+        return self.joints[:, _INDEX[name]]
 
     @cached_property
     def lengths(self) -> list[tuple[Float, float]]:
@@ -448,8 +445,7 @@ class Body:
     @cached_property
     def statures(self) -> Float:
         """Return the stature that each limb is usual for."""
-        statures: Float = np.array([median(length) / share for length, share in self.lengths])
-        return statures
+        return np.array([median(length) / share for length, share in self.lengths])
 
     def proportions(self, stature: float) -> dict[str, Oddity]:
         """Measure the size, and the limbs' lengths over those that are usual for a stature in m."""
@@ -534,8 +530,7 @@ class Body:
         """Return a vector [T, 3] to where the hips face, also of somebody who lies or is on their head."""
         upwards = self.shoulders - self.hips
         upwards /= np.linalg.norm(upwards, axis=-1, keepdims=True)
-        forwards: Float = np.cross(upwards, self["right_hip"] - self["left_hip"])
-        return forwards
+        return np.cross(upwards, self["right_hip"] - self["left_hip"])
 
     def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, Oddity]:
         """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides.
@@ -624,8 +619,7 @@ class Body:
 
 def finite(values: Float) -> Float:
     """Return the finite values."""
-    known: Float = values[np.isfinite(values)]
-    return known
+    return values[np.isfinite(values)]
 
 
 def quantile(values: Float, share: float) -> float:

@@ -75,16 +75,14 @@ class SolvedJoints(NamedTuple):
 
 def pixel_variance(scene: SceneOfMoments) -> Float:
     """Return the variance [C] px^2 of keypoints: it grows with the person in the picture."""
-    variance: Float = _KEYPOINT_PX**2 + (_KEYPOINT_SHARE * scene.person_px) ** 2
-    return variance
+    return _KEYPOINT_PX**2 + (_KEYPOINT_SHARE * scene.person_px) ** 2
 
 
 def _directions(scene: SceneOfMoments) -> Float:
     """Return the unit rays [C, T, J, 3] in the world."""
     x, y = scene.rays[..., 0], scene.rays[..., 1]
     local = np.stack([x, y, np.ones_like(x)], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]
-    direction: Float = local @ np.swapaxes(scene.rotation, -1, -2)
-    return direction
+    return local @ np.swapaxes(scene.rotation, -1, -2)
 
 
 def solve(scene: SceneOfMoments) -> SolvedJoints:
@@ -204,8 +202,7 @@ def _with_errors(scene: SceneOfMoments, errors: Float) -> SceneOfMoments:
 def _constant_sigma(scene: SceneOfMoments) -> Float:
     """Return the standard deviations [C, 6] of the constant errors."""
     level = np.sqrt(np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0))
-    sigma: Float = np.repeat(np.maximum(level, _LEAST_SIGMA), 3, axis=1)
-    return sigma
+    return np.repeat(np.maximum(level, _LEAST_SIGMA), 3, axis=1)
 
 
 def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Float]:
@@ -376,8 +373,7 @@ def picture_variance(scene: SceneOfMoments) -> Float:
     times = scene.rays.shape[1]
     turned2 = _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times)
     moved2 = _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)
-    variance: Float = pixel_variance(scene) / scene.focal_px**2 + turned2 + moved2 / _USUAL_M**2
-    return variance
+    return pixel_variance(scene) / scene.focal_px**2 + turned2 + moved2 / _USUAL_M**2
 
 
 def _varying2(varying: Float, white: Float, times: int) -> Float:
@@ -386,8 +382,7 @@ def _varying2(varying: Float, white: Float, times: int) -> Float:
     What is not new in every pose is worth `FEW` independent pictures, however many there are.
     """
     lasting2 = np.maximum(varying**2 - white**2, 0.0)
-    variance: Float = white**2 + lasting2 * times / FEW
-    return variance
+    return white**2 + lasting2 * times / FEW
 
 
 def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]:

@@ -135,8 +135,7 @@ def _turned(before: Float, after: Float, logged: Float, moved: Float) -> Float:
 
 
 def _vectors(rotation: Float) -> Float:
-    vectors: Float = rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
-    return vectors
+    return rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
 
 
 def lateness(
