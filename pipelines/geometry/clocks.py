@@ -140,19 +140,22 @@ def find_steps(header_ns: Int64, receive_ns: Int64) -> list[ClockStep]:
         pause_s = float(np.diff(receive[k - 4 : k + 6]).max()) / 1e9
         near_s = float(np.median(after[:_MIN_MESSAGES]) - np.median(before[-_MIN_MESSAGES:]))
         off = np.abs(np.concatenate([before - level_s, after - level_s - step_s]))
-        around_s = interval_s[first : last - 1]
+        around_s = np.delete(interval_s[first : last - 1], k - first)
         own_s = interval_s[k] - float(np.median(around_s))
         uneven_s = np.quantile(np.abs(around_s - np.median(around_s)), _SEPARATED_SHARE)
         scatter_s = 1.4826 * float(np.median(off)) * float(np.sqrt(np.pi))
         sigma_s, near_sigma_s = scatter_s / np.sqrt(window), scatter_s / np.sqrt(_MIN_MESSAGES)
+        # The header's own interval is evidence, too, if all others are alike.
+        is_even = uneven_s < _MIN_STEP_S / 10
+        sigmas = _SIGNIFICANT_STEP_SIGMAS / (2 if is_even else 1)
         if (
-            max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * sigma_s) < abs(step_s) <= MAX_STEP_S
+            max(_MIN_STEP_S, sigmas * sigma_s) < abs(step_s) <= MAX_STEP_S
             and abs(own_s - step_s) < abs(step_s) / 2
             and abs(near_s - step_s) < abs(step_s) / 4 + 2 * near_sigma_s
             and pause_s < 3 * usual_s + abs(step_s) / 2  # the receipt goes on
             and uneven_s < abs(step_s) / 4
             and lasted_s > _MIN_DURATION_S / 2  # messages of a queue arrive at once
-            and np.quantile(off, _SEPARATED_SHARE) < abs(step_s) / 2
+            and (is_even or np.quantile(off, _SEPARATED_SHARE) < abs(step_s) / 2)
         ):
             if uneven_s < sigma_s and abs(own_s - step_s) < max(usual_s / 2, 3 * sigma_s):
                 step_s = own_s  # the header's own interval has less scatter
@@ -192,6 +195,32 @@ class StampGap:
     usual_s: float  # the other intervals
     excess_s: float  # by which it is longer; negative where the stamps go back
 
+    @property
+    def goes_back(self) -> bool:
+        """True if a later stamp is clearly below an earlier one, which no loss of messages explains."""
+        return self.usual_s + self.excess_s < -_MIN_STEP_S
+
+
+def may_step(received_ns: Int64) -> bool:
+    """Test if stamps of receipt [N] go back, or come late or early for longer than delays do."""
+    window = 5 * _MIN_MESSAGES
+    if len(received_ns) < 2 * window:
+        return len(received_ns) >= 4 * _MIN_MESSAGES
+    if (np.diff(received_ns) < -_MIN_STEP_S * 1e9).any():
+        return True
+    lead_s = (received_ns - received_ns[0]) / 1e9
+    lead_s -= np.arange(len(lead_s)) * lead_s[-1] / (len(lead_s) - 1)
+    level_s = np.median(np.lib.stride_tricks.sliding_window_view(lead_s, window), axis=1)
+    change_s = level_s[window:] - level_s[:-window]
+    return bool(np.abs(change_s - np.median(change_s)).max() > _MIN_STEP_S / 2)
+
+
+def steps_alike(lead_ns: Int64, gap: StampGap) -> bool:
+    """Test if the stamps of receipt have the header's gap, too, given header less receipt [N]."""
+    width = 5 * _MIN_MESSAGES
+    before, after = lead_ns[max(gap.index - width, 0) : gap.index], lead_ns[gap.index :][:width]
+    return float(np.abs(np.median(after) - np.median(before))) / 1e9 < abs(gap.excess_s) / 2
+
 
 def find_gaps(stamps_ns: Int64) -> list[StampGap]:
     """Find the few gaps of an even sequence of stamps [N], which are in the order of writing."""
@@ -199,18 +228,22 @@ def find_gaps(stamps_ns: Int64) -> list[StampGap]:
     if len(interval_s) < 4 * _MIN_MESSAGES:
         return []
     usual_s = float(np.median(interval_s))
-    off_s = np.abs(interval_s - usual_s)
-    least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(off_s)))
-    places = np.flatnonzero((off_s > least_s) & ((interval_s > 0) | (interval_s < -_MIN_STEP_S)))
+    off_s = interval_s - usual_s
+    least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(np.abs(off_s))))
     found = []
-    for k in places.tolist() if len(places) <= _MOST_GAPS else []:
-        before_s, after_s = off_s[max(k - 2 * _MIN_MESSAGES, 0) : k], off_s[k + 1 :][: 2 * _MIN_MESSAGES]
-        around = np.concatenate([before_s, after_s])
-        if min(k, len(interval_s) - 1 - k) >= _MIN_MESSAGES and (
-            np.quantile(around, _SEPARATED_SHARE) < off_s[k] / 4
-        ):
-            found.append(StampGap(k + 1, usual_s, float(interval_s[k]) - usual_s))
-    return found
+    for places in (np.flatnonzero(off_s < -least_s), np.flatnonzero(off_s > least_s)):
+        for k in places.tolist() if len(places) <= _MOST_GAPS else []:
+            before_s, after_s = off_s[max(k - 2 * _MIN_MESSAGES, 0) : k], off_s[k + 1 :][: 2 * _MIN_MESSAGES]
+            around = np.abs(np.concatenate([before_s, after_s]))
+            # A late message is followed by a shorter interval, and the step of a clock is not.
+            lasts_s = float(off_s[max(k - 2, 0) : k + 3].sum())
+            if (
+                min(k, len(interval_s) - 1 - k) >= _MIN_MESSAGES
+                and np.quantile(around, _SEPARATED_SHARE) < abs(off_s[k]) / 4
+                and abs(lasts_s - off_s[k]) < abs(off_s[k]) / 2
+            ):
+                found.append(StampGap(k + 1, usual_s, float(off_s[k])))
+    return sorted(found, key=lambda gap: gap.index)
 
 
 def time_passed(t_ns: Int64, values: Float, gap: StampGap, at: int) -> bool | None:
@@ -230,6 +263,8 @@ def time_passed(t_ns: Int64, values: Float, gap: StampGap, at: int) -> bool | No
     scatter = float(np.sqrt(np.mean(np.concatenate(left) ** 2) * values.shape[1]))
     moved = lines[1][0] * t_s[at] + lines[1][1] - lines[0][0] * t_s[at - 1] - lines[0][1]
     velocity, change = (lines[0][0] + lines[1][0]) / 2, float(np.linalg.norm(lines[1][0] - lines[0][0]))
+    # Stamps with jitter leave the interval itself uncertain.
+    scatter += float(np.linalg.norm(velocity) * max(np.std(np.diff(t_s[side])) for side in sides))
 
     def misfit(passed_s: float) -> float:
         """Return the distance from where the body should be, in units of what is usual."""

@@ -18,7 +18,7 @@ from pipelines.formats.logs.messages import Edge, LoggedRows, Source, Stamps, al
 from pipelines.formats.logs.recordings import LogPart, OpenLog, begins_like, open_parts
 from pipelines.formats.poses import clean_poses
 from pipelines.geometry.arrays import Int64
-from pipelines.geometry.clocks import MAX_STEP_S, StampGap, find_gaps, time_passed
+from pipelines.geometry.clocks import MAX_STEP_S, StampGap, find_gaps, may_step, steps_alike, time_passed
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.poses import Link, chain, continuous_signs, find_route, pose_covariance_in_body
 from pipelines.session.errors import DataError
@@ -338,10 +338,10 @@ def _named(edge: Edge) -> str:
 
 # --- the recorder's clock ----------------------------------------------------------------------------------
 
-# The motion of a body before and after a gap is seen within this time.
-_AROUND_GAP_NS = 1_000_000_000
 # A shorter gap that motion does not explain is usual loss, and not worth a line.
 _NOTED_GAP_S = 0.1
+# The receipt of a message waits for less, so its clock was set among so many messages before the header's.
+_IN_FLIGHT = 10
 
 
 def open_recording(paths: Sequence[Path], open_part: Callable[[Path], LogPart]) -> OpenLog:
@@ -349,7 +349,7 @@ def open_recording(paths: Sequence[Path], open_part: Callable[[Path], LogPart]) 
 
     All stamps of receipt step with the clock, and with them those of the headers that the same clock makes.
     Stamps that go back in the order of writing show it. A gap shows it if bodies moved on as if no time had
-    passed.
+    passed. Headers show it to the ms, because receipt is delayed and headers are not.
     """
     log = OpenLog(*open_parts(paths, open_part))
     for part in log.parts:
@@ -357,8 +357,8 @@ def open_recording(paths: Sequence[Path], open_part: Callable[[Path], LogPart]) 
         if not counts:
             continue
         densest = np.sort(part.rows_of([max(counts, key=lambda channel: (counts[channel], -channel))]))
-        for gap in find_gaps(part.received_ns[densest]):
-            _take_out_gap(log, part, densest, gap)
+        if may_step(part.received_ns[densest]):
+            _take_out_gaps(log, part, densest)
     return log
 
 
@@ -386,47 +386,74 @@ class LogFile:
         return open_recording(paths, self.open_part)
 
 
-def _take_out_gap(log: OpenLog, part: LogPart, densest: Int64, gap: StampGap) -> None:
+def _take_out_gaps(log: OpenLog, part: LogPart, densest: Int64) -> None:
+    """Take steps of the clock out of a part; `densest` are the rows of its densest topic."""
+    bodies = _written_bodies(log, part)
+    header_gaps: list[tuple[Int64, StampGap]] = []
+    if bodies and (header_ns := bodies[0].header_ns).all():
+        rows = bodies[0].receive_ns
+        lead_ns = header_ns - part.received_ns[rows]
+        header_gaps = [(rows, gap) for gap in find_gaps(header_ns) if steps_alike(lead_ns, gap)]
+    for rows, gap in header_gaps or [(densest, gap) for gap in find_gaps(part.received_ns[densest])]:
+        _take_out_gap(log, part, rows, gap, bodies)
+
+
+def _written_bodies(log: OpenLog, part: LogPart) -> list[LoggedRows]:
+    """Return the bodies of a part's topic of most poses, the densest first, in the order of writing.
+
+    The numbers of their rows are in place of the stamps of receipt.
+    """
+    topics = [topic for topic in log.topics if kind_of(topic) in {"poses", "transforms"} and topic.count]
+    if not topics:
+        return []
+    name = max(topics, key=lambda topic: topic.count).name
+    received_ns, part.received_ns = part.received_ns, np.arange(len(part.received_ns))
+    bodies: dict[Edge, _Samples] = {}
+    try:
+        for sample in all_samples(log.messages([name], last_ns=len(received_ns)), "log"):
+            if isinstance(sample, PoseSample):
+                bodies.setdefault((sample.target, sample.source), _Samples()).add_pose(sample)
+    finally:
+        part.received_ns = received_ns
+        log.forget()
+    return sorted((body.rows(7) for body in bodies.values()), key=lambda body: -len(body.values))
+
+
+def _take_out_gap(log: OpenLog, part: LogPart, rows: Int64, gap: StampGap, bodies: list[LoggedRows]) -> None:
     """Take out a step of the clock that is the gap between two rows of a part; note it."""
-    first, last = densest[gap.index - 1 : gap.index + 1].tolist()
-    leaps_s = np.diff(part.received_ns[first : last + 1]) / 1e9
-    row = first + 1 + int(np.argmax(leaps_s * np.sign(gap.excess_s)))
-    if abs(leaps_s[row - first - 1] - gap.excess_s) > max(1.5 * gap.usual_s, abs(gap.excess_s) / 4):
+    before, last = rows[[max(gap.index - _IN_FLIGHT, 0), gap.index]].tolist()
+    leaps_s = np.diff(part.received_ns[before : last + 1]) / 1e9
+    row = last - int(np.argmax(leaps_s[::-1] * np.sign(gap.excess_s)))  # the last one of equal leaps
+    uneven_s = float(np.quantile(np.abs(np.diff(part.received_ns[rows]) / 1e9 - gap.usual_s), 0.9))
+    if (
+        abs(leaps_s[row - before - 1] - gap.excess_s)
+        > max(1.5 * gap.usual_s, abs(gap.excess_s) / 4) + uneven_s
+    ):
         return  # other messages were received in the gap
-    after_s = int(part.received_ns[first] - part.received_ns[densest[0]]) / 1e9
+    after_s = int(part.received_ns[rows[gap.index - 1]] - part.received_ns[rows[0]]) / 1e9
     told = f"all stamps step by {gap.excess_s:+.3f} s at {after_s:.2f} s"
-    stepped = True if gap.excess_s < 0 else _clock_stepped(log, gap, int(part.received_ns[row]))
+    stepped = True if gap.goes_back else _clock_stepped(part, bodies, gap, last)
     if stepped and abs(gap.excess_s) <= MAX_STEP_S:
         log.take_out(part, row, round(gap.excess_s * 1e9))
         log.notes.append(f"{told}: the recorder's clock was set; taken out")
-    elif stepped or (stepped is None and gap.excess_s >= _NOTED_GAP_S):
+    elif stepped or (stepped is None and abs(gap.excess_s) >= _NOTED_GAP_S):
         log.notes.append(
             f"{told}: the log does not tell if its clock was set or messages were lost; not taken out"
         )
 
 
-def _clock_stepped(log: OpenLog, gap: StampGap, at_ns: int) -> bool | None:
-    """Test by all bodies of a log if a clock was set in a gap that ends at `at_ns`; None if none tells."""
-    topics = [topic.name for topic in log.topics if kind_of(topic) in {"poses", "transforms"}]
+def _clock_stepped(part: LogPart, bodies: list[LoggedRows], gap: StampGap, row: int) -> bool | None:
+    """Test by all bodies of a part if a clock was set in a gap that ends at a row; None if none tells."""
     found: set[bool] = set()
-    messages = log.messages(
-        topics, first_ns=at_ns - round(gap.excess_s * 1e9) - _AROUND_GAP_NS, last_ns=at_ns + _AROUND_GAP_NS
-    )
-    bodies: dict[tuple[str, str], _Samples] = {}
-    for sample in all_samples(messages, "log"):
-        if isinstance(sample, PoseSample):
-            bodies.setdefault((sample.target, sample.source), _Samples()).add_pose(sample)
-    for body in bodies.values():
-        rows = body.rows(7)
-        at = int(np.searchsorted(rows.receive_ns, at_ns))
-        if not 0 < at < len(rows.receive_ns):
+    for body in bodies:
+        at = int(np.searchsorted(body.receive_ns, row))
+        if not 0 < at < len(body.receive_ns):
             continue
-        leap_s = float(rows.header_ns[at] - rows.header_ns[at - 1]) / 1e9
-        if rows.header_ns[at - 1] and abs(leap_s - gap.usual_s - gap.excess_s) > gap.excess_s / 4:
+        t_ns = body.header_ns if body.header_ns.all() else part.received_ns[body.receive_ns]
+        if abs(int(t_ns[at] - t_ns[at - 1]) / 1e9 - gap.usual_s - gap.excess_s) > abs(gap.excess_s) / 4:
             return False  # the headers have a clock of their own
-        turned = continuous_signs(rows.values[:, 3:])
-        for values in (rows.values[:, :3], turned):
-            passed = time_passed(rows.receive_ns, values, gap, at)
+        for values in (body.values[:, :3], continuous_signs(body.values[:, 3:])):
+            passed = time_passed(t_ns, values, gap, at)
             found |= set() if passed is None else {not passed}
     return found.pop() if len(found) == 1 else None
 
