@@ -11,17 +11,18 @@ import bisect
 import re
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
-from itertools import chain
+from functools import lru_cache
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
 from pipelines.formats.common.rows import describe_times
-from pipelines.geometry.arrays import Int64, Picture
+from pipelines.geometry.arrays import Bool, Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import UNTIMED, VideoIndex
 from pipelines.session.storage import as_data_error, damaged, empty
@@ -49,6 +50,9 @@ _BLACK = 16
 _EYE_BGR = (0.114, 0.587, 0.299)
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _PACKET_TS, _PACKET_M2TS = 188, 192
+# Phones halve their rate in the dark. A lost frame doubles an interval.
+_GAP = 1.5
+_NOT_GIVEN = "not given by a decoder, before the first key frame or after a lost frame"
 # The first bytes of containers, and FFmpeg's names of them.
 _MAGIC = {
     b"\x1a\x45\xdf\xa3": "matroska",
@@ -133,7 +137,7 @@ class VideoContainer:
         The largest video stream is used, without cover pictures and frames that are hidden or only referred
         to. pts_ns[k] is the stamp of frame k less that of frame 0; those of equal stamps are spread up to the
         next. Counted in `dropped`: "cut off" (frames in the table after the end of the file, and the last
-        ones shown later than the first lost one), "no stamp", "before the first frame that can be decoded".
+        ones shown later than the first lost one), "no stamp", "not given by a decoder".
         """
         with VideoReader(path) as reader:
             return reader.index
@@ -205,18 +209,9 @@ class VideoReader:
         self._scan = _scan(path)
         self._reader: object = None  # the iteration of `frames` that moved the decoder last
         self._begin()
-        if (
-            self._next is not None
-            and self._next[0]
-            and (unseen := _frames_before_the_first(path, self._scan))
-        ):
-            self._scan = self._scan.without_first(unseen)
-            self.close()
-            self._begin()
         if self._next is None:
             self.close()
-            count = len(self._scan.ticks)
-            raise DataError(path, f"none of its {count} frames can be decoded", "export it again, as MP4")
+            raise _undecodable(path, len(self._scan.ticks))
         if _is_mirrored(self._next[1]):
             self.close()
             problem = "shows its pictures mirrored (by its display matrix)"
@@ -322,12 +317,6 @@ class _Scan:
     dropped: dict[str, int]
     is_raw: bool = False
 
-    def without_first(self, count: int) -> _Scan:
-        """Leave out the first frames, which no decoder gives."""
-        keys = [key - count for key in self.key_frames if key >= count]
-        dropped = {**self.dropped, "before the first frame that can be decoded": count}
-        return replace(self, ticks=self.ticks[count:], key_frames=keys, dropped=dropped)
-
 
 class _CodedFrame(NamedTuple):
     """Coded frame as it is stored."""
@@ -338,10 +327,18 @@ class _CodedFrame(NamedTuple):
 
 
 def _scan(path: Path) -> _Scan:
-    """Read the stamps of all packets, in the order of showing."""
+    """Read the stamps of all packets that a decoder turns into pictures, in the order of showing."""
+    try:
+        about = path.stat()
+    except OSError as error:
+        raise as_data_error(error, path) from error
+    return _scan_of(path, about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(maxsize=8)  # raw streams and those with gaps are decoded for it
+def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
     container, stream = open_container(path)
     with container:
-        size = path.stat().st_size
         stored = [
             _CodedFrame(packet.pos, packet.pts, packet.is_keyframe)
             for packet in packets(container, stream)
@@ -352,9 +349,13 @@ def _scan(path: Path) -> _Scan:
         tick_s, listed = Fraction(stream.time_base or 0), stream.frames
         is_raw = container.format.name in _RAW
     if is_raw:
-        unseen = _unseen_at_the_start(path)
-        scan = _Scan(np.arange(len(stored), dtype=np.int64), Fraction(1), [], {}, is_raw)
-        return scan.without_first(unseen) if unseen else scan
+        container, stream = open_container(path)
+        with container:
+            count = sum(1 for _ in _decoded(container, stream, None))
+        if not count:
+            raise _undecodable(path, len(stored))
+        unseen = {_NOT_GIVEN: len(stored) - count} if count < len(stored) else {}
+        return _Scan(np.arange(count, dtype=np.int64), Fraction(1), [], unseen, is_raw)
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
@@ -374,35 +375,65 @@ def _scan(path: Path) -> _Scan:
     hidden = tick_s >= 1 and 2 * len(ticks) < listed
     if hidden or shown_s < _SHORTEST_S * (len(ticks) - 1):
         raise damaged(path, f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s")
-    counts = {"cut off": len(lost) + len(stamped) - len(sure), "no stamp": len(whole) - len(stamped)}
-    once = np.ones(len(ticks), np.bool_)
-    once[1:] &= np.diff(ticks) > 0
-    once[:-1] &= np.diff(ticks) > 0
+    keys = np.array([pts for pts, key in sure if key], np.int64)
+    given = _given(path, ticks, _key_frames(ticks, keys))
+    counts = {
+        "cut off": len(lost) + len(stamped) - len(sure),
+        "no stamp": len(whole) - len(stamped),
+        _NOT_GIVEN: int(np.count_nonzero(~given)),
+    }
+    ticks = ticks[given]
     return _Scan(
         ticks,
         tick_s,
-        np.flatnonzero(np.isin(ticks, [pts for pts, key in sure if key]) & once).tolist(),
+        _key_frames(ticks, keys),
         {cause: count for cause, count in counts.items() if count},
     )
 
 
-def _unseen_at_the_start(path: Path) -> int:
-    """Count the coded frames up to the third key frame that no decoder gives."""
+def _key_frames(ticks: Int64, keys: Int64) -> list[int]:
+    """Return the numbers of the key frames, of stamps that no other frame has."""
+    once = np.ones(len(ticks), np.bool_)
+    once[1:] &= np.diff(ticks) > 0
+    once[:-1] &= np.diff(ticks) > 0
+    return np.flatnonzero(np.isin(ticks, keys) & once).tolist()
+
+
+def _given(path: Path, ticks: Int64, keys: list[int]) -> Bool:
+    """Mark the frames [N] that a decoder gives: after a lost one it may give none up to the next key frame.
+
+    Only frames around gaps of the stamps are decoded for it, and those before the first key frame.
+    """
+    given = np.ones(len(ticks), np.bool_)
+    interval = np.diff(ticks)
+    gaps = np.flatnonzero(interval > _GAP * np.median(interval)).tolist() if len(interval) else []
+    gaps = gaps if keys[:1] == [0] else [-1, *gaps]
+    bounds = [0, 0, *keys, len(ticks), len(ticks)]  # at the edges of the video, too
+    done = 0
+    for gap in gaps:
+        key = bisect.bisect_right(keys, gap) + 1  # of the last key frame before the gap, in `bounds`
+        first, end = max(bounds[key], done), bounds[min(key + 2, len(bounds) - 1)]
+        if first < end:
+            found = _decoded_stamps(path, ticks, bounds[key - 1], end)
+            if bounds[key - 1] and (not found or found[0] > ticks[bounds[key - 1]]):  # the seek went too far
+                return np.isin(ticks, _decoded_stamps(path, ticks, 0, len(ticks)))
+            given[first:end] = np.isin(ticks[first:end], found)
+            done = end
+    return given
+
+
+def _decoded_stamps(path: Path, ticks: Int64, first: int, end: int) -> list[int]:
+    """Decode from a key frame or before it up to another one, and return the stamps of all pictures."""
     from av.error import FFmpegError
 
     container, stream = open_container(path)
     with container:
-        unseen = keys = 0
-        for packet in packets(container, stream):
-            keys += packet.is_keyframe
-            if keys > 2:
-                break
-            unseen += 1
-            with suppress(FFmpegError):
-                unseen -= len(stream.decode(packet))
-        with suppress(FFmpegError):
-            unseen -= len(stream.decode(None))
-    return max(unseen, 0)
+        if first:
+            with suppress(FFmpegError):  # a container that cannot seek begins at its beginning
+                container.seek(int(ticks[first]), stream=stream, backward=True)
+        decoded = _decoded(container, stream, None, sought=first > 0)
+        stamps = (frame.pts for frame in decoded if frame.pts is not None)
+        return list(takewhile(lambda pts: end == len(ticks) or pts < ticks[end], stamps))
 
 
 def _is_mirrored(frame: VideoFrame) -> bool:
@@ -447,14 +478,6 @@ def _nanoseconds(ticks: Int64, tick_s: Fraction, origin: int = 0) -> Int64:
 
 
 # --- decoding -----------------------------------------------------------------------------------------
-
-
-def _frames_before_the_first(path: Path, scan: _Scan) -> int:
-    """Count the frames of the index before the first one that a decoder gives, damaged or not."""
-    container, stream = open_container(path)
-    with container:
-        first = next((frame.pts for frame in _decoded(container, stream, None)), None)
-    return 0 if first is None else int(np.searchsorted(scan.ticks, first))
 
 
 def _decoded(
@@ -522,6 +545,10 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
     # Not frame by frame: then the output for a damaged frame would depend on the number of processors.
     stream.thread_type = "SLICE"
     return container, stream
+
+
+def _undecodable(path: Path, count: int) -> DataError:
+    return DataError(path, f"none of its {count} frames can be decoded", "export it again, as MP4")
 
 
 def _unreadable(path: Path, kind: str, problem: str) -> DataError:
