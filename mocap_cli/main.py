@@ -1,11 +1,11 @@
 """The `mocap` command: its group, and the only place that turns errors into a line and an exit status."""
 
+from __future__ import annotations
+
 import errno
 import os
 import signal
 import sys
-from types import FrameType
-from typing import Any
 
 # Shells expect this exit status after Ctrl-C.
 _INTERRUPTED = 130
@@ -34,6 +34,8 @@ if _is_script and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
 
 from contextlib import suppress  # noqa: E402
 from importlib import import_module  # noqa: E402
+from types import FrameType  # noqa: E402
+from typing import Any  # noqa: E402
 
 import click  # noqa: E402
 
