@@ -299,7 +299,8 @@ OPENCV = CalibrationFile("opencv", "OpenCV calibration", (*_YAML, ".xml"), _is_o
 
 
 def _is_easymocap(head: str) -> bool:
-    return "!!opencv-matrix" in head and bool(re.search(r"(?m)^names:(?s:.*)^(?:K|R|Rot)_\w+:", head))
+    has_names = re.search(r"(?m)^names:", head) and re.search(r"(?m)^(?:K|R|Rot)_\w+:", head)
+    return "!!opencv-matrix" in head and bool(has_names)
 
 
 def _read_easymocap(path: Path) -> Cameras:
@@ -378,16 +379,21 @@ def _read_camodocal(path: Path) -> Cameras:
     storage = Storage(path)
     model, name = storage.text("model_type").upper(), storage.text("camera_name") or "camera"
     size = [storage.number(f"image_{side}") for side in ("width", "height")]
-    names = {"PINHOLE": "fx fy cx cy", "MEI": "gamma1 gamma2 u0 v0", "KANNALA_BRANDT": "mu mv u0 v0"}
+    names = {
+        **dict.fromkeys(("PINHOLE", "PINHOLE_FULL"), "fx fy cx cy"),
+        "MEI": "gamma1 gamma2 u0 v0",
+        "KANNALA_BRANDT": "mu mv u0 v0",
+    }
     if model not in names:
         raise DataError(path, f"has the model {model[:40]!r}", f"calibrate it as {', '.join(names)}")
     matrix = _matrix_of(*(storage.number(f"projection_parameters/{key}") for key in names[model].split()))
     if model == "KANNALA_BRANDT":
         coefficients = [storage.number(f"projection_parameters/k{k}") for k in range(2, 6)]
         return {name: _stored_camera(path, name, size, matrix, coefficients, fisheye=True)}
-    radtan = [storage.number(f"distortion_parameters/{key}") for key in ("k1", "k2", "p1", "p2")]
+    keys = ("k1", "k2", "p1", "p2", *(("k3", "k4", "k5", "k6") if model == "PINHOLE_FULL" else ()))
+    radtan = [storage.number(f"distortion_parameters/{key}") for key in keys]
     xi = storage.number("mirror_parameters/xi")
-    if model == "PINHOLE" or not xi or not np.diag(matrix).all():
+    if model.startswith("PINHOLE") or not xi or not np.diag(matrix).all():
         return {name: _stored_camera(path, name, size, matrix, radtan)}
     focal, coefficients, off_px = _fisheye_like(size, matrix, radtan, xi) if xi > 0 else (1.0, [], np.inf)
     if not off_px <= MAX_APPROXIMATION_PX:
@@ -429,7 +435,7 @@ CAMODOCAL = CalibrationFile(
     "camodocal",
     "camodocal calibration (VINS)",
     _YAML,
-    lambda head: _has_keys(head, ("model_type", "projection_parameters")),
+    lambda head: _has_keys(head, ("model_type", "(?:projection|poly)_parameters")),
     _read_camodocal,
 )
 

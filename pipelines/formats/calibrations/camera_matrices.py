@@ -120,7 +120,7 @@ def _camera_line(camera: CalibratedCamera) -> str:
         size = f"{lens.width} x {lens.height} px" if camera.size_stated else "size not stated"
         parts.append(f"{size}, f {lens.fx:.1f} {lens.fy:.1f}, {lens.model}")
     if camera.position is not None:
-        parts.append("at " + " ".join(f"{value:.3f}" for value in camera.position))
+        parts.append("at " + " ".join(f"{value + 0:.3f}" for value in camera.position))
     if camera.note:
         parts.append(camera.note)
     return ", ".join(parts)

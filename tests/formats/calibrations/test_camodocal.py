@@ -40,12 +40,15 @@ def mei(p2: float = MEI["p2"]) -> str:
     return one + f"   gamma1: {MEI['gamma']}\n   gamma2: {MEI['gamma']}\n   u0: 370.0\n   v0: 241.0\n"
 
 
-def test_a_pinhole_projects_as_opencv_does(tmp_path: Path) -> None:
-    lens, note = lens_of(tmp_path, "PINHOLE", PINHOLE)
+@pytest.mark.parametrize("more", [[], [0.03, 0.1, -0.05, 0.01]])
+def test_a_pinhole_projects_as_opencv_does(tmp_path: Path, more: list[float]) -> None:
+    full = "".join(f"   k{number}: {value}\n" for number, value in enumerate(more, start=3))
+    text = PINHOLE.replace("distortion_parameters:\n", f"distortion_parameters:\n{full}")
+    lens, note = lens_of(tmp_path, "PINHOLE_FULL" if more else "PINHOLE", text)
     matrix = np.array([[461.6, 0, 363.0], [0, 460.3, 248.1], [0, 0, 1]])
     near = POINTS * [0.4, 0.4, 1]
     expected, _ = cv2.projectPoints(
-        near, np.zeros(3), np.zeros(3), matrix, np.array([-0.29, 0.08, 4e-4, 2e-4])
+        near, np.zeros(3), np.zeros(3), matrix, np.array([-0.29, 0.08, 4e-4, 2e-4, *more])
     )
     np.testing.assert_allclose(project(near, lens), expected[:, 0], atol=1e-9)
     assert not note
