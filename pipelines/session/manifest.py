@@ -366,16 +366,21 @@ class FrameTimes(FileSource):
     """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
     needs_file = False
-    start_ns: SecondsAsNs = Field(0, alias="start")
-    """Time of the first picture, s."""
-    start_from: Literal["container"] | None = None
-    """Source of the time of the first picture: the video's metadata."""
+    start_ns: SecondsAsNs | Literal["container"] = Field(0, alias="start")
+    """Time of the first picture, s; or `container`: the video's metadata have it."""
     fps: Fps | None = None
     """Frame rate, which replaces the stamps of the video: 30, 29.97 or 30000/1001."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _start_by_its_old_name(cls, value: object) -> object:
+        if isinstance(value, dict) and value.get("start_from") == "container" and "start" not in value:
+            return {"start" if key == "start_from" else key: each for key, each in value.items()}
+        return value
+
     @model_validator(mode="after")
     def _from_one_place(self) -> FrameTimes:
-        counted = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))
+        counted = (("start", "start_ns"), ("fps", "fps"))
         stated = [key for key, name in counted if name in self.model_fields_set]
         if self.file and stated:
             problem = f"has {', '.join(['file', *stated])}, which say different things of the same pictures"
@@ -392,7 +397,7 @@ class FrameTimes(FileSource):
     @property
     def is_placed(self) -> bool:
         """True if the times are world times: more than a rate, or the container's stamps from 0 on."""
-        return self.has_start or self.start_from is not None or bool(self.file)
+        return self.has_start or bool(self.file)
 
 
 class CameraClock(Guess, DelayedSource):

@@ -113,9 +113,8 @@ class FlightCameras:
             )
         if logged is None:
             return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
-        if times.has_start or times.start_from:
-            key = "start" if times.has_start else "start_from"
-            problem = f"cameras.{name}.frame_times: {key} has no use, the log stamps its pictures"
+        if times.has_start:
+            problem = f"cameras.{name}.frame_times: start has no use, the log stamps its pictures"
             remedy = "leave it out, or correct the log's clock with logs: {...: {clock: ...}}"
             raise DataError(self._manifest, problem, remedy, code="stated-twice")
         return pictures
@@ -146,7 +145,7 @@ class FlightCameras:
 
     def _start_ns(self, name: str, camera: CameraSources, times: FrameTimes) -> int:
         """Return the start of a video that has stamps of its own."""
-        if times.start_from is None:
+        if isinstance(times.start_ns, int):
             return times.start_ns
         path = self._files.video_file(camera)
         made_ns = _made_ns(path) if path is not None else None
@@ -159,7 +158,7 @@ class FlightCameras:
                 f"{name}: its video says that it was made at {made_ns / 1e9:.0f} s, to a second at best:"
                 " say clock: {sigma_s: 1}"
             )
-        return times.start_ns + made_ns
+        return made_ns
 
     def _frames_by_stamps(
         self, t_ns: Int64, dropped: dict[str, int], pictures: CameraFrames | None

@@ -117,7 +117,7 @@ cameras:
 def test_a_flight_of_pictures_has_their_times_and_poses(tmp_path: Path) -> None:
     write(tmp_path / "film")
     manifest = tmp_path / "flight.yaml"
-    manifest.write_text(MANIFEST.format(times="{start_from: container}"))
+    manifest.write_text(MANIFEST.format(times="{start: container}"))
     succeeds("ingest", manifest)
     stored = pd.read_parquet(tmp_path / "flight.session/cameras/drone1/frames.parquet")
     assert stored["t_ns"].tolist() == [START_NS + 500_000_000 * k for k in range(COUNT)]
