@@ -39,7 +39,7 @@ from pipelines.session.registries import (
 )
 from pipelines.session.storage import refuse_camera_names, refuse_names_of_people
 from pipelines.session.yaml_files import read_yaml_model
-from pipelines.session.yaml_models import SecondsAsNs, YamlModel, describe_problem, unknown_key
+from pipelines.session.yaml_models import SecondsAsNs, YamlModel, describe_problem, nanoseconds, unknown_key
 
 O = TypeVar("O", bound=YamlModel)
 
@@ -82,6 +82,9 @@ def _fps(value: object) -> Fraction:
 
 Quaternion = Annotated[list[float], Field(min_length=4, max_length=4), AfterValidator(_unit_quaternion)]
 Fps = Annotated[Fraction, BeforeValidator(_fps)]
+Start = Annotated[
+    int | Literal["container"], BeforeValidator(lambda v: v if v == "container" else nanoseconds(v))
+]
 
 
 # --- options of files ----------------------------------------------------------------------------------
@@ -366,7 +369,7 @@ class FrameTimes(FileSource):
     """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
     needs_file = False
-    start_ns: SecondsAsNs | Literal["container"] = Field(0, alias="start")
+    start_ns: Start = Field(0, alias="start")
     """Time of the first picture, s; or `container`: the video's metadata have it."""
     fps: Fps | None = None
     """Frame rate, which replaces the stamps of the video: 30, 29.97 or 30000/1001."""
