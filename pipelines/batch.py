@@ -102,19 +102,12 @@ def batch(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Batch:
-    """Run the stages over many flights, and write a summary.
+    """Run the stages over many flights, and write a summary; a flight that fails does not stop the others.
 
-    A flight that fails does not stop the others, and still gets its report if it was ingested.
-
-    Args:
-        output: the folder of all; by default sessions lie beside manifests, and the summary
-            in `batch/` of the working directory.
-        workers: the number of processes on this machine, one flight each; by default one per core.
-        scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
-        overwrite: replace files that have the names of the summary's but are not of a batch.
-
-    DataError: Dask is not installed, no scheduler answers, sessions would have the same name, or the summary
-    cannot be written. Errors of a flight are in its row.
+    By default sessions lie beside manifests, and the summary in `batch/` of the working directory. `workers`
+    are processes of one flight each, one per core by default; `scheduler` the address of a Dask cluster with
+    the same folders. `overwrite` replaces files of the summary's names that are of no batch. DataError: Dask
+    is not installed, no scheduler answers, sessions would have one name, or the summary cannot be written.
     """
     settings, progress = settings or BatchSettings(), progress or Silent()
     unknown = [stage for stage in settings.stages if stage not in STAGES]

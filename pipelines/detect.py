@@ -114,17 +114,11 @@ def detect(
 ) -> StageRecord | None:
     """Detect keypoints for cameras without imported ones, in a session that the caller has locked.
 
-    Args:
-        detector: a registered name, or a family's name, a colon and its argument.
-        people: the number that is wanted; of one who was logged, the actor alone is followed.
-        start_s: use only pictures at or after this time, in seconds since the flight's first frame.
-        end_s: use only pictures before this time.
-        executor: works on the blocks instead of `workers` processes; the result depends on neither.
-
-    Return the record of the stage; None if every camera has imported keypoints.
-
-    DataError: the detector's files are missing, pictures are gone or not those that were ingested, a table of
-    the session was changed, or nobody was found in any picture.
+    `people` is the number that is wanted; of one who was logged, the actor alone is followed. Pictures from
+    `start_s` to before `end_s` (s since the flight's first frame) are used. An `executor` replaces `workers`
+    processes; the result depends on neither. None if every camera has imported keypoints. DataError: the
+    detector's files are missing, pictures are gone or not those that were ingested, a table was changed, or
+    nobody was found in any picture.
     """
     progress = progress or Silent()
     description = read_description(session.folder)

@@ -90,18 +90,11 @@ def export(
 ) -> Exported:
     """Write a session in other formats, and `export.json` with a description of each file and its notes.
 
-    No file gets its final name before everything is written. Files of an earlier export that are unchanged
-    since are replaced; `overwrite` replaces other files, too.
-
-    Args:
-        output: the output folder; by default beside the session, with `.export` instead of `.session`.
-        unit: of lengths, for formats that have a choice; by default that of each format.
-        axes: z-up or y-up, for formats that have a choice; by default those of each format.
-        time: zero (the flight's first picture) or epoch (the session's own times), for formats with a choice.
-        pictures_hz: pictures of each camera per second, for recordings that hold pictures; 0 is none.
-
-    DataError: no such format or choice, nothing to export, tables or pictures that were changed, or a file
-    would be overwritten. BusyError: another process exports to the same folder.
+    The default `output` is beside the session, with `.export` for `.session`; files of an earlier export that
+    are unchanged are replaced, others with `overwrite`. `unit`, `axes` (z-up, y-up) and `time` (zero: the
+    first picture; epoch) are for formats that have a choice; `pictures_hz` of each camera, 0 for none.
+    DataError: no such format or choice, nothing to export, changed tables or pictures, or a file would be
+    overwritten. BusyError: another process exports to the same folder.
     """
     progress = progress or Silent()
     exports = [find_export(name) for name in dict.fromkeys(formats)]

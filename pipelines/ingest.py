@@ -115,14 +115,10 @@ def ingest(
 ) -> Ingested:
     """Read a flight into a session, by default `<name of the manifest>.session` beside it.
 
-    Args:
-        max_pose_gap_s: frames between two logged poses further apart than this have no pose.
-        max_extrapolation_s: frames further than this before or after all logged poses have none.
-        strict: refuse a flight if any part of it could not be read or used, or if its logs are doubted.
-        overwrite: write also to a target that holds something else.
-
-    DataError: something cannot be used, or was changed while it was read; the session stays as it was.
-    BusyError: another process writes the session.
+    Frames have no pose between two further apart than `max_pose_gap_s`, or further than `max_extrapolation_s`
+    before or after all. `strict` refuses a flight of which anything could not be used, or that is doubted;
+    `overwrite` writes also to a target that holds something else. DataError: something cannot be used, or was
+    changed while it was read; the session stays as it was. BusyError: another process writes the session.
     """
     progress = progress or Silent()
     flight = read_flight(flight_path)

@@ -161,14 +161,9 @@ class BodyModel:
         return first, corners[np.sort(once[whole[once]])]
 
     def reach(self, bones: Index, offset: Float) -> Float:
-        """Express points that are fixed to bones as vectors of every bone.
+        """Express points fixed to bones [K], at `offset` [K, 3] statures from their joints, by every bone.
 
-        Args:
-            bones: [K] the bone that each point is fixed to.
-            offset: [K, 3] from the bone's joint, neutral axes, relative to the stature.
-
-        Returns:
-            [1 + K modes, K, 22, 3]: with the shape's shares, the vectors u of the module's formula.
+        Return [1 + K modes, K, 22, 3]: with the shape's shares, the vectors u of the module's formula.
         """
         found = np.zeros((len(self.joint), len(bones), len(BONES), 3))
         for k, bone in enumerate(np.asarray(bones).tolist()):
@@ -375,14 +370,11 @@ def blend(rest: Float, bone: NDArray[np.int64], weight: Float, matrix: Float, tr
 
 
 def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:
-    """Compute the turn of each bone from rest to neutral: [22, 4] quaternions xyzw.
+    """Compute the turn [22, 4] xyzw of each bone from rest joints [22, 3] m, x forward, to neutral.
 
-    Trunk and head stay. Legs come down straight, arms straight with the hands forward of the elbows'
-    bend, so that a knee or elbow bends about the axis from side to side; feet point ahead, soles level.
-
-    Args:
-        rest_joint: [22, 3] m, x forward, y left, z up.
-        lean_rad: angle of the arms from the vertical, outward, to clear the hips.
+    Trunk and head stay, legs come down straight, arms with the hands forward of the elbows' bend and
+    `lean_rad` from the vertical to clear the hips; so a knee or elbow bends about the axis from side to side.
+    Feet point ahead, soles level.
     """
     turns = np.tile(np.eye(3), (len(BONES), 1, 1))
     for sign, side in zip((1.0, -1.0), SIDES, strict=True):

@@ -134,15 +134,10 @@ def triangulate(
     """Triangulate every joint-frame by a method of the module; ValueError for min_views below 2, or no gate.
 
     `gate` counts standard deviations of a view's image point, pixel and pose noise together. Covariances are
-    NaN without `with_covariance`, which saves a third of the time. Statuses besides
-    "ok":
-
-    * `not_detected`: by no camera.
-    * `few_views`: detected by fewer than `min_views` cameras.
-    * `no_pose`: fewer than `min_views` of the detections have a camera pose.
-    * `low_parallax`: no two viewing lines differ by `MIN_PARALLAX_DEG` (opposite directions do not count).
-    * `rejected`: fewer than `min_views` views agree within `gate` (`robust`), or the point is behind one of
-      its cameras (`dlt` and `midpoint`, which reject no view).
+    NaN without `with_covariance`, which saves a third of the time. Statuses besides "ok": `not_detected` by
+    any camera; `few_views`: detected by fewer than `min_views`; `no_pose`: fewer of the detections have one;
+    `low_parallax`: no two lines differ by `MIN_PARALLAX_DEG`; `rejected`: fewer views agree within `gate`
+    (`robust`), or the point is behind a camera (`dlt`, `midpoint`, which reject no view).
     """
     if min_views < 2 or not gate > 0:
         raise ValueError(f"min_views={min_views}, gate={gate}: out of range")

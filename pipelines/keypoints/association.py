@@ -86,29 +86,17 @@ def associate(
 ) -> Association:
     """Choose the detections of the people who were logged, then of others, most seen first.
 
-    Detections of different cameras and times are grouped into bodies (see `bodies`); where several are seen,
-    again without the pose errors that all bodies of a picture share. Of the bodies each logged person is the
-    one that fits their log best, so that the sum over all of them is greatest; nobody stands in for a logged
-    person whom no camera sees. Others are those seen in most camera-frames by two cameras or more, ties by
-    confidence. The order of detections within a camera and frame does not matter. A lone view is kept where
-    its picture continues the person's last one.
+    Detections are grouped into bodies (see `bodies`); where several are seen, again without the pose errors
+    that all bodies of a picture share. Of the bodies each logged person is the one that fits their log best,
+    with the greatest sum over all; nobody stands in for a logged person whom no camera sees. Others are those
+    seen in most camera-frames by two cameras or more, ties by confidence. A lone view is kept where its
+    picture continues the person's last one.
 
-    Args:
-        time_s: [T] seconds, strictly increasing.
-        xy: [T, C, D, J, 2] undistorted normalised picture coordinates, NaN where there is nothing. A few
-            well-detected joints (8 or so) are enough where memory is short; at least 3 must be common.
-        confidence: [T, C, D, J]; joints with 0 or NaN are not used.
-        position: [T, C, 3] m, world_from_camera; NaN: the camera has no pose and gets no choice.
-        rotation: [T, C, 3, 3] world_from_camera.
-        sigma: [T, C] rad, standard deviation of a viewing ray on each axis: pixel and pose noise, and
-            clock error times the actor's angular speed.
-        actors: [T, A, 3] m, the people who were logged, person 0 first, NaN where unknown. If no log is
-            near anybody, none is used.
-        actor_sigma_m: standard deviation of the logs on each axis; of several people the largest one, and
-            their noise is estimated from bodies that three cameras place.
-        people: number of people to choose; None: those who were logged and whoever else is a person as far
-            as two cameras or more can tell (`why_no_person`), at least one.
-        scene: the surroundings, by which bodies that are nobody are left out.
+    `xy` [T, C, D, J, 2] are undistorted and normalised, NaN for nothing; joints of `confidence` 0 or NaN are
+    not used; poses [T, C, ...] are world_from_camera, NaN without one; `sigma` [T, C] rad is that of a ray
+    per axis, by pixels, poses and clocks. `actors` [T, A, 3] m were logged, NaN where unknown, with
+    `actor_sigma_m` per axis; of several that is the largest, and is estimated from bodies that three cameras
+    place. `people` None: those who were logged and whoever else is a person (`why_no_person`), at least one.
     """
     if confidence.shape[2] == 0:  # no detections at all: make room for one absent person
         xy = np.full((*xy.shape[:2], 1, *xy.shape[3:]), np.nan)

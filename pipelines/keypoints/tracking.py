@@ -107,24 +107,16 @@ class PeopleTracker:
     """Tracker of people through the pictures of one camera; results depend only on pictures and hints so far.
 
     A person is searched at the place of the joints in the last picture. The person detector runs around
-    people just lost, and around the hint of each logged person who is not seen: in each of the first 30
-    pictures, then in every fifth. It runs on tiles of the whole picture if nobody is followed, and every
-    `search_every` pictures (10 with `only_one`, else 5). Each such search takes the next few tiles, so that
-    the cost of a large picture spreads over several. The first picture is searched until a person is found.
+    people just lost, and around the hint of each logged person who is not seen (in the first 30 pictures,
+    then every fifth), on tiles of the whole picture if nobody is followed, and every `search_every` pictures
+    (10 with `only_one`, else 5), a few tiles each time.
 
-    With `only_one`, one person is wanted: fewer tiles are searched while somebody is followed. With a hint,
-    those who cannot be the actor, by place or size, are not followed while somebody can, and the whole
-    picture is searched only while nobody can. The place of the hint is searched in turns, a square every
-    `search_every` pictures, because the one who is followed may be somebody who stands near.
+    With `only_one` fewer tiles are searched while somebody is followed. With a hint, those who cannot be the
+    actor, by place or size, are not followed while somebody can. Things that are no people are dropped by
+    their scores, where the networks say which (`TellsPeople`), but never the only track.
 
-    Things that are no people are dropped by their scores, where the networks say which (`TellsPeople`). The
-    only track is kept, and so is the only one that can be a logged person.
-
-    `counts` are frames; searched (frames in which the person detector ran); found (new numbers); lost (not
-    seen for more than 5 frames); found again (where they were lost, under the old number); merged (two
-    numbers on one body, the older stays); beyond the most (people found but not followed, in each search
-    again); no people (tracks dropped by their scores); not the actor (by place or size); without anybody
-    (frames).
+    `counts` are frames; searched; found (new numbers); lost (not seen for more than 5 frames); found again;
+    merged (two numbers on one body); beyond the most; no people; not the actor; without anybody (frames).
     """
 
     def __init__(

@@ -598,10 +598,9 @@ def measure(
 class _Smoother:
     """Smoothing over time by which the joint estimate reduces errors that change from picture to picture.
 
-    Errors of triangulated joints are divided into one that all joints share and the rest of each. Both are
-    smoothed by the least accelerations, as large as those of the joints, that agree with the information of
-    the views: keypoints for the rest, keypoints and white pose noise for what is shared. Constant and slow
-    pose errors stay.
+    The error that all joints share, and the rest of each, are smoothed by the least accelerations, as large
+    as those of the joints, that agree with the information of the views: keypoints for the rest, keypoints
+    and white pose noise for what is shared. Constant and slow pose errors stay.
     """
 
     def __init__(self, paths: CameraPaths, joints: Float) -> None:

@@ -148,13 +148,11 @@ def score(
 ) -> Scores:
     """Compute the figures of one flight, JSON-able: degrees and metres by name, None where nothing counts.
 
-    `position` [N, T, 3] m are the cameras, `actor` [T, 3] or [N, T, 3] whom they film; all finite. `people`
-    are [P, T, 3] if there are several: shares and errors are means over them, distances are those to the
-    nearest. `seen` is [P, N, T], by default the free lines of sight to the actor. `limit_violations` counts
-    episodes of each drone (of each pair for separation); speeds are those without the way [N, T, 3] to which
-    gusts `pushed`. `path_m` and `energy_kj` are means over drones,
-    `blind_s` is the time in which fewer than two of them see the actor, `predicted_error_m` sqrt(tr S) of the
-    ray model while two free views or more determine it.
+    `position` [N, T, 3] m are the cameras, `actor` [T, 3] or [N, T, 3] whom they film, `people` [P, T, 3]:
+    shares and errors are means over them, distances are to the nearest. `seen` is [P, N, T], by default the
+    free lines of sight. `limit_violations` counts episodes of each drone or pair, speeds without the way [N,
+    T, 3] to which gusts `pushed`. `blind_s` is the time in which fewer than two drones see the actor,
+    `predicted_error_m` sqrt(tr S) of the ray model while it is determined.
     """
     slots = slot_of(position - actor)
     tilt_deg = np.degrees(slots[..., TILT])

@@ -261,20 +261,11 @@ class Background:
 
 
 def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
-    """Refine the poses of one camera by its background.
+    """Refine logged poses [T, 3] m (NaN: none) and [T, 3, 3] of one camera by its background.
 
-    Args:
-        seen: the background.
-        position: [T, 3] m, logged; NaN without a pose.
-        rotation: [T, 3, 3] logged world_from_camera.
-        prior: standard deviations of the log's errors.
-
-    Returns:
-        Adjusted poses, in stretches that overlap. If one is refused, all logged poses stay and `refused`
-        gives the reason. Pictures without a pose stay without one.
-
-    Where nobody stated the noise, a position that never changes was surveyed, to `SURVEYED_M`, if pictures
-    fit a camera that only turns. Otherwise the log may be `frozen`.
+    If a stretch is refused, all logged poses stay. Where nobody stated the noise, a position that never
+    changes was surveyed, to `SURVEYED_M`, if pictures fit a camera that only turns; else the log may be
+    `frozen`.
     """
     posed = position[np.isfinite(position[:, 0])]
     if not prior.estimated or not len(posed) or np.ptp(posed, axis=0).max() >= _NEVER_MOVES_M:
@@ -359,18 +350,11 @@ def clock_offset(
     *,
     quick: bool = False,
 ) -> tuple[float, float] | None:
-    """Find by how much pictures were taken later than their stamps: the log turns as the background then.
+    """Find by how much (s) pictures were taken later than their stamps, and the standard deviation of that.
 
-    Args:
-        seen: the background.
-        poses_at: function that returns the logged poses, as for `adjust`, this many seconds after the stamps.
-        prior: standard deviations of the log's errors.
-        quick: look at few pictures once; larger offsets are not exact then.
-
-    Returns:
-        Offset and its standard deviation, s, by the background alone. None if the camera turns too little in
-        the middle of the flight or its turning does not determine the offset, if there are too few poses or
-        the adjustment fails, or if no offset was found at which the next one is the same.
+    The log turns as the background then. `poses_at` gives the poses for `adjust` so many seconds after the
+    stamps. `quick` looks at few pictures once, and is rough for larger offsets. None: the camera turns too
+    little in the middle of the flight, the adjustment fails, or no offset is stable.
     """
     offset_s, before_s, levels = 0.0, 0.0, replace(prior, clock_s=_ANY_CLOCK_S)
     for again in range(_CLOCK_ROUNDS):
@@ -416,12 +400,10 @@ def _sigma_of_constants(prior: PosePrior) -> Float:
 
 
 def _remaining(draws: Float, period_s: float, shift: float) -> PoseErrors:
-    """Describe errors [M, T, 6] drawn from the posterior as white, constant and slow ones.
+    """Describe errors [M, T, 6] drawn from the posterior as white, constant and slow; add `shift` (m).
 
-    The shift of the whole path, of this standard deviation (m), is not in the draws.
-
-    Differences of neighbours that are not explained by those of pictures two apart are white. The mean over
-    the flight is constant. The rest is a Gauss-Markov process with the lag at which it has lost 1 / e.
+    Differences of neighbours beyond those of pictures two apart are white, the mean over the flight is
+    constant, the rest a Gauss-Markov process with the lag at which it has lost 1 / e.
     """
     white, processes = [0.0, 0.0], []
     for kind, number in enumerate((SHIFT_IN_WORLD, ROTATION)):
@@ -774,17 +756,11 @@ class _Stretch:
 
 
 def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> PosePrior:
-    """Estimate the levels of the constant rotation and of the lever arm, three numbers of each.
+    """Estimate the levels of the constant rotation (rad) and lever arm (m) from their posterior, mean [6].
 
-    They say little, so a usual level counts as `USUAL_COUNT` more (inverse gamma prior; expectation
-    maximisation). What is known well stays what it is. What rests on a drifting path gives way: a rotation to
-    the log, an arm to none. A rotation of which the pictures say little keeps its wide level. An arm's never
-    grows: a large one that pictures hardly show would bend the path.
-
-    Args:
-        prior: levels with which the constants were found.
-        found: [6] posterior mean: rotation (rad), shift in the camera (m).
-        covariance: [6, 6], posterior.
+    They say little, so a usual level counts as `USUAL_COUNT` more numbers (inverse gamma prior; expectation
+    maximisation). What rests on a drifting path gives way: a rotation to the log, an arm to none. A rotation
+    of which pictures say little keeps its wide level; an arm's never grows, or it would bend the path.
     """
     place, turn, arm = prior.constant
     if 1 - np.trace(covariance[:3, :3]) / (3 * turn**2) >= _LEAST_DETERMINED:
@@ -933,17 +909,10 @@ def refine_cameras(
     *,
     between: Interpolation,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    """Refine the poses of cameras by their backgrounds.
+    """Refine the poses of cameras by the backgrounds that were `followed`, or keep them for the reason there.
 
-    Args:
-        cameras: all of them.
-        followed: background of each camera by its name, or the reason why none was followed.
-        errors: those stated for each camera's log; None for unknown ones, whose levels are estimated.
-        between: rules for interpolating between logged poses.
-
-    Returns:
-        The cameras, with the errors that remain. The entry of each in metrics.json. A warning for each camera
-        that keeps its logged poses, or whose log may be frozen.
+    `errors` are those stated for each log, None for unknown ones. Return the cameras with the errors that
+    remain, the entry of each in metrics.json, and warnings.
     """
     refined: list[Camera] = []
     entries: dict[str, Any] = {}
@@ -993,19 +962,9 @@ def clocks_of_backgrounds(
 ) -> tuple[Float, Float]:
     """Find the clock offset of each camera that turns: its log turns as its background does.
 
-    A rough search finds offsets of some tenths of a second, and the adjustment of the poses the rest.
-
-    Args:
-        cameras: all of them.
-        followed: background of each camera by its name, or the reason why none was followed.
-        errors: as for `refine_cameras`.
-        clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
-        stated: [C] True for clocks of which a quick look decides if they are estimated; by default none.
-        between: rules for interpolating between logged poses.
-
-    Returns:
-        Offset [C] to add to the pictures' times and its standard deviation [C], s; NaN where the clock is
-        known or the background does not determine it.
+    A rough search finds some tenths of a second, the adjustment of poses the rest. `clock_sigma_s` [C] is 0
+    for a known clock; for `stated` ones a quick look decides first. Return offsets [C] to add to the
+    pictures' times and their standard deviations, s; NaN where the clock is known or not determined.
     """
     found = np.full((len(cameras), 2), np.nan)
     for c, (camera, stated_errors) in enumerate(zip(cameras, errors, strict=True)):

@@ -114,18 +114,10 @@ def bodies_of_one_camera(
     stature_m: float | None,
     static: bool,
 ) -> OneCamera:
-    """Fit a body to each person whom the only camera sees.
+    """Fit a body to each person whom the only camera sees; DataError: landmarks that are not known.
 
-    Args:
-        observations: of one camera.
-        views: the same, one row for each joint-frame.
-        ground: gives the height of the ground under places [N, 3], NaN where it is unknown, and its error.
-        of_map: the height is that of the top of a voxel, and the error its side.
-        stature_m: as stated, None if nobody did.
-        static: the camera stands still, and its pose is exact unless its noise is stated.
-
-    Raises:
-        DataError: the landmarks of the skeleton are not known.
+    `ground` gives the height under places [N, 3], NaN where it is unknown, and its error: of a map (`of_map`)
+    the top of a voxel and its side. A `static` camera without stated noise is exact.
     """
     times, people, joints, _ = observations.confidence.shape
     known = landmarks_of(observations.joints)

@@ -244,17 +244,11 @@ class Normal:
 def fit_body(
     landmarks: Landmarks, t_ns: Int64, place: Float, errors: Callable[[Index], tuple[Float, Float]]
 ) -> BodyFit | None:
-    """Fit the body to one person's landmarks.
+    """Fit the body to one person's K landmarks, `place` [T, K, 3] m, NaN where missing; None without one.
 
-    Args:
-        landmarks: K of them.
-        t_ns: [T] increasing.
-        place: [T, K, 3] m, NaN where missing.
-        errors: gives for N of the times the covariances of each landmark's own error, [N, K, 3, 3] m^2, and
-            of the error that all landmarks of a time share, [N, 3, 3] m^2.
-
-    Returns:
-        The body at all times with both hips, both shoulders and ten landmarks; None if there is none.
+    `errors` gives for N of the times the covariances m^2 of each landmark's own error [N, K, 3, 3], and of
+    the error that all landmarks of a time share [N, 3, 3]. The body has all times with both hips, both
+    shoulders and ten landmarks.
     """
     known = np.asarray(np.isfinite(place).all(axis=-1))
     trunk = [landmarks.joints.index(name) for name in _TRUNK]

@@ -123,14 +123,10 @@ def is_wrong(offset_s: Float, sigma_s: Float) -> Bool:
 
 
 def initial_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
-    """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks.
+    """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks, or if none is.
 
-    Args:
-        views_at: function that returns the views with all unknown clocks moved forward by a number of
-            seconds; joint-frames are grouped by time, the same number at each time.
-        instants: number of these times.
-        clock_sigma_s: [C] prior standard deviation of each offset, 0 for a known clock. Without a known
-            clock all offsets are 0.
+    `views_at` returns the views with all unknown clocks moved forward by seconds, the same number of
+    joint-frames at each of the `instants`; `clock_sigma_s` [C] is 0 for a known clock.
     """
     initial_s = np.zeros(len(clock_sigma_s))
     unknown = np.flatnonzero(clock_sigma_s > 0)
@@ -157,16 +153,9 @@ def wrong_clocks(
 ) -> Float:
     """Find clocks [C] s at whose stated times views disagree clearly more than at other times; 0 for others.
 
-    One clock after the other is moved: that which lowers the disagreement most. So most clocks must be right,
-    or be questioned by their backgrounds before.
-
-    Args:
-        views_at: function that returns the views with all clocks moved forward by a number of seconds;
-            joint-frames are grouped by time, the same number at each time.
-        t_s: [T] these times.
-        questioned: [C] True for clocks that may be wrong.
-        pixel_sigma: standard deviation of a good keypoint (px).
-        reference: the camera whose clock is the right one where two explain the same.
+    One clock after the other is moved: that which lowers the disagreement most, so most must be right.
+    `views_at` is as for `initial_offsets_s`, `t_s` [T] the times, `questioned` [C] who may be wrong. Of two
+    that explain the same, the clock of `reference` is right.
     """
     steps = int(SEARCH_REACH_SIGMAS * QUESTIONED_SIGMA_S / SEARCH_STEP_S)
     shifts_s = SEARCH_STEP_S * np.arange(-steps, steps + 1)

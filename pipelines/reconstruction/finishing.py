@@ -165,17 +165,9 @@ def finish(
     fill_s: float | None,
     smoother: Butterworth | None,
 ) -> tuple[Triangulation, dict[str, Any]]:
-    """Fill gaps of at most `fill_s`, smooth, and report both.
+    """Fill gaps of at most `fill_s` (None: none), smooth (None: not), and report both as JSON.
 
-    Args:
-        observations: the triangulated observations.
-        views: the same, one row for each joint-frame.
-        fill_s: the longest gap to fill, None to fill none.
-        smoother: the filter, None for no smoothing.
-
-    Returns:
-        The result, and JSON-able `filled` and `smoothing`, None for a step not requested. Residuals are
-        those of the new positions. Filled joints have no residuals and no views.
+    Residuals are those of the new positions. Filled joints have no residuals and no views.
     """
     report: dict[str, Any] = {"filled": None, "smoothing": None}
     shape = observations.confidence.shape[:3]
@@ -223,22 +215,11 @@ class Filled:
 
 
 def fill_gaps(t_ns: Int64, position: Float, covariance: Float, status: Int8, *, max_gap_s: float) -> Filled:
-    """Interpolate joints across gaps of at most that length.
+    """Interpolate joints [T, P, J, 3] m across gaps of at most that length between two measured samples.
 
-    The covariance at share a of a gap is (1-a)^2 C0 + a^2 C1 + 4 a (1-a) M. The first two terms are those of
-    a straight line between the ends. M is the mean outer product of the interpolation errors in the middle
-    of gaps of that length.
-
-    Args:
-        t_ns: [T] strictly increasing.
-        position: [T, P, J, 3] m; NaN unless the status is "ok".
-        covariance: [T, P, J, 3, 3] m^2.
-        status: [T, P, J] index into STATUS.
-        max_gap_s: the longest gap that is filled, from the last measured sample to the next.
-
-    Returns:
-        Skeleton with unchanged measured samples. These gaps stay open: longer ones, those before the first
-        and after the last measured sample, and those next to a single sample between two gaps.
+    The covariance at share a of a gap is (1-a)^2 C0 + a^2 C1 + 4 a (1-a) M: a straight line between the ends,
+    and M the mean outer product of the interpolation errors in the middle of gaps of that length. A gap next
+    to a single sample between two gaps stays open.
     """
     filled = Filled(position.copy(), covariance.copy(), status.copy(), {})
     t_s = (t_ns - t_ns[0]) / 1e9

@@ -199,12 +199,9 @@ def bind_positions(
 ) -> GroundBinding:
     """Bind the constant position errors of cameras to each other by the ground that they see.
 
-    Args:
-        cameras: all of them. Moving ones take part whose poses were refined by their backgrounds (`errors`
-            state what is left); still ones are exact unless `sigma` says otherwise.
-        followed: background of each camera by its name, or the reason why there is none.
-        stills: some pictures of each camera; a camera without them takes no part.
-        between: rules for interpolating between logged poses.
+    Moving cameras take part whose poses were refined by their backgrounds; still ones are exact unless
+    `sigma` says otherwise. `followed` has backgrounds by name, or the reason why there is none, `stills` some
+    pictures of each camera that takes part.
     """
     views = [_view(camera, followed.get(camera.name), stills.get(camera.name), between) for camera in cameras]
     prior, bent = _prior_sigma(cameras), np.array([_bent(camera) for camera in cameras])
@@ -736,10 +733,8 @@ def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Sol
     """Estimate the level of constant position errors that are only assumed, by MacKay's rule.
 
     A wide level would let the ground turn all cameras together: it binds their attitudes to each other better
-    than to the world, and their places follow. A usual level counts as `USUAL_COUNT` more numbers.
-
-    Returns:
-        Standard deviations [6 C], no larger than before.
+    than to the world, and their places follow. A usual level counts as `USUAL_COUNT` more numbers. The
+    standard deviations [6 C] are no larger than before.
     """
     assumed = _assumed(cameras)
     if not assumed.any():

@@ -80,19 +80,10 @@ def load_cameras(
     pose_noise: str | None,
     calibrated: Calibrated | None = None,
 ) -> tuple[list[Camera], list[str]]:
-    """Load every camera with keypoints; also return warnings.
+    """Load every camera with keypoints; also return warnings. DataError: none has, or they share no joint.
 
-    Args:
-        folder: the session.
-        description: its session.json.
-        detected: the record of the detector's stage, if it ran.
-        min_confidence: keypoints with a lower raw confidence are not used.
-        pose_noise: pose noise that replaces the flight's own, None to keep that.
-        calibrated: function from the detector's raw confidences [N] of joints [N] to probabilities. Without
-            it raw confidences are used; those of imported keypoints are never calibrated.
-
-    Raises:
-        DataError: no camera has keypoints, or cameras share no joint.
+    Keypoints below `min_confidence` (raw) are not used; `pose_noise` replaces the flight's own. `calibrated`
+    maps the detector's raw confidences [N] of joints [N] to probabilities; those of imported keypoints stay.
     """
     sources = _keypoints(folder, description, detected)
     if not sources:
@@ -169,12 +160,9 @@ def load_pose_errors(
 ) -> list[PoseErrors] | None:
     """Load the prior of each camera's pose errors over time; None if not known for all moving cameras.
 
-    Errors that remain after a correction by the background are known. Beside such cameras, those without any
-    statement have errors of the size that poses of drones usually have (`UNKNOWN_SIGMA`).
-
-    A logged covariance gives the size of errors, not their correlation over time (`errors_of_level`): the
-    white part uses the covariance of each pose, the constant part the median. A static camera without stated
-    noise was calibrated, and counts as exact beside cameras with stated noise.
+    Cameras without any statement beside those corrected by a background have errors of usual size
+    (`UNKNOWN_SIGMA`). Of a logged covariance the white part uses that of each pose, the constant part the
+    median (`errors_of_level`). A static camera without stated noise counts as exact beside others with.
     """
     stated: list[PoseErrors | None] = []
     for camera in cameras:

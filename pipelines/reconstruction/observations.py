@@ -215,14 +215,9 @@ def _poses_at(cameras: list[Camera], t_ns: Int64, between: Interpolation) -> tup
 def observe(
     cameras: list[Camera], found: Candidates, choice: Int64, t_ns: Int64, between: Interpolation
 ) -> Observations:
-    """Interpolate the chosen people's keypoints and the cameras' poses to the common times.
+    """Interpolate the keypoints of chosen detections [T', C, P] (-1: none) and the poses to common times [T].
 
-    Args:
-        cameras: all of them, in order.
-        found: the candidates to which `choice` refers.
-        choice: [T', C, P] index of each person's detection in the camera's frame, -1 for none.
-        t_ns: [T] the common times; poses at times of the candidates are theirs.
-        between: rules for interpolating between logged poses.
+    Poses at times of the candidates are theirs.
     """
     views, weights, sigmas = [], [], []
     for c, camera in enumerate(cameras):
@@ -249,16 +244,7 @@ def observe(
 
 
 def on_sides(rays: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
-    """Give each joint its own view where left and right were exchanged.
-
-    Args:
-        rays: [T, P, J, ..., 2].
-        confidence: [T, P, J, ...].
-        sides: [T, P, J, ...] the joint whose view belongs to each joint; -1 for none.
-
-    Returns:
-        Both in the same shape; NaN and 0 where no view is left.
-    """
+    """Give each joint [T, P, J, ...] the view of the joint in `sides`, -1 for none: NaN and 0 then."""
     kept, joint = sides >= 0, np.maximum(sides, 0)
     own_xy = np.take_along_axis(rays, joint[..., None], axis=2)
     own_confidence = np.take_along_axis(confidence, joint, axis=2)

@@ -135,19 +135,11 @@ def fit_seen_body(
     stature_m: tuple[float, float],
     pose_sigma: Float,
 ) -> SeenBody | None:
-    """Fit the body to one person's landmarks in the pictures of one camera.
+    """Fit the body to one person's K landmarks in the pictures of one camera, between moments of ten or more.
 
-    Args:
-        landmarks: K of them.
-        t_ns: [T] increasing.
-        rays: of T moments; `sigma` is relative: 1 for a landmark of which the detector is sure.
-        ground: where feet stand.
-        stature_m: the mean of its prior and its standard deviation.
-        pose_sigma: [T, 2] m, rad, standard deviations per axis of the camera's poses. Their errors are part
-            of the level's, and are added to all covariances.
-
-    Returns:
-        The body between moments of ten landmarks or more; None if there is none.
+    `sigma` of the rays is relative: 1 for a landmark of which the detector is sure. `stature_m` is the mean
+    of its prior and its standard deviation. Errors of poses, `pose_sigma` [T, 2] m and rad per axis, are part
+    of the level's, and are added to all covariances. None if there is no body.
     """
     (row,) = np.nonzero(rays.direction.any(axis=-1).sum(axis=1) >= MIN_LANDMARKS)
     if not len(row):

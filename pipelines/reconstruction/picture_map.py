@@ -210,15 +210,7 @@ def shrunk(picture: Picture) -> Picture:
 def followed_features(
     tracks: Tracks, rows: Index, keys: Index, intrinsics: Intrinsics, t_ns: Int64
 ) -> list[KeyFeatures]:
-    """Return the points of each key picture.
-
-    Args:
-        tracks: points in shrunk pictures; they count the followed ones.
-        rows: [P] rows of the followed pictures.
-        keys: rows of the key pictures, among them.
-        intrinsics: the lens.
-        t_ns: times of all rows.
-    """
+    """Return the points of the key pictures among the followed rows [P]; tracks are in shrunk pictures."""
     whole = replace(tracks, xy=(tracks.xy + 0.5) / shrinkage(intrinsics.width, intrinsics.height) - 0.5)
     rays = rays_at_stamps(whole, intrinsics, t_ns[rows])
     features = []
@@ -246,15 +238,9 @@ def features_of(picture: Picture, intrinsics: Intrinsics) -> KeyFeatures:
 def map_pictures(
     features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool = False
 ) -> PictureMap:
-    """Map key pictures by their features.
+    """Map key pictures by their features; NoAttitudesError: too few of them are in one map.
 
-    Args:
-        features: [P] of all key pictures.
-        intrinsics: the lens.
-        refine_focal: its focal length is a guess; it is refined if the pictures determine it, else held.
-
-    Raises:
-        NoAttitudesError: too few pictures are in one map.
+    With `refine_focal` the focal length is a guess, and is refined if the pictures determine it.
     """
     import pycolmap
 
@@ -445,18 +431,10 @@ def lay_on_places(
     places: Float,
     errors: PoseErrors | None,
 ) -> LaidMap:
-    """Lay a map on the logged places of its camera.
+    """Lay a map on logged places [N, 3] m (z up) of its camera, at times [N]; key pictures have times [P].
 
-    Args:
-        found: the map.
-        intrinsics: the lens, as given for the map.
-        key_t_ns: [P] times of all key pictures.
-        t_ns: [N] times of the places.
-        places: [N, 3] m in the world, z up.
-        errors: the prior of the places' errors; None to take the residuals of the fit for them.
-
-    Raises:
-        NoAttitudesError: the places do not determine the attitudes, or do not fit the map.
+    `errors` is the prior of the places' errors; None takes the residuals of the fit. NoAttitudesError: the
+    places do not determine the attitudes, or do not fit the map.
     """
     from scipy.interpolate import CubicSpline
     from scipy.linalg import cholesky

@@ -155,22 +155,12 @@ class RefinedFlight:
 def doubted_people(
     observations: Observations, views: Views, result: Triangulation, doubts: Sequence[str], pixel_sigma: float
 ) -> list[str]:
-    """Say of each person why they must not determine cameras and clocks; "" for those who do.
+    """Say of each person [P] why they must not determine cameras and clocks; "" for those who do.
 
     Views that show different things pull their cameras. Pose errors move all people of a picture by about the
-    same: what the joints of a person have in common in each picture is therefore compared with the first
-    person who is not doubted. A right person who is left out costs little: they are placed with the corrected
-    cameras all the same.
-
-    Args:
-        observations: the people's rays.
-        views: the same, one row for each joint-frame.
-        result: `robust` of the views.
-        doubts: [P] causes that are known already, "" for none.
-        pixel_sigma: standard deviation of a good keypoint (px).
-
-    Returns:
-        [P] the causes; "residual" where the views disagree too much. If everybody is doubted, nobody is.
+    same, so what a person's joints have in common in each picture is compared with the first person who is
+    not doubted ("residual" if views disagree too much). `doubts` are causes that are known. If everybody is
+    doubted, nobody is.
     """
     shape = observations.confidence.shape
     away = result.points[:, None] - views.position[views.pose_index]
@@ -247,13 +237,10 @@ def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
 
 
 def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, reference: str) -> FoundClocks:
-    """Find which stated clocks the rays of people contradict.
+    """Find which stated clocks the rays of people contradict, among `questioned` [C].
 
-    Args:
-        flight: the flight.
-        questioned: [C] True for clocks that may be wrong.
-        held: [C] True for clocks that are stated or found, with those that are questioned.
-        reference: name of the camera whose clock is right where two explain the same.
+    `held` [C] are stated or found, with those that are questioned; of two clocks that explain the same, that
+    of the camera `reference` is right.
     """
     none = np.zeros(len(held))
     offset_s, names = none.copy(), [camera.name for camera in flight.cameras]
@@ -479,10 +466,6 @@ def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
     """List pairs of joints [B, 2] with a nearly constant distance: bones, and the points of the head.
 
     Shoulders come nearer to the hips where a person bends, so the trunk is no bone.
-
-    Args:
-        joints: names of one person's joints.
-        people: number of people; the joints of each follow those of the one before.
     """
     number = {name: index for index, name in enumerate(joints)}
     head = [number[name] for name in _HEAD if name in number]
@@ -588,15 +571,10 @@ def refine_in_windows(
     workers: int = 1,
     executor: Executor | None = None,
 ) -> Refined:
-    """Run `refine`, whose arguments these are, on some windows, and join the results.
+    """Run `refine`, whose arguments these are, on some of the windows of `windows_of`, and join the results.
 
     Joints outside the windows, and in a window that was refused, are NaN. The clocks are medians of the
     windows. The result is refused if all windows are.
-
-    Args:
-        windows: those of `windows_of`, or some of them.
-        workers: the number of processes, as far as memory allows.
-        executor: works on the windows instead.
     """
     levels = None if prior is None else list(prior)
     whole = _Order(t_s, tuple(sightings), start, bones, levels, clock_sigma_s, measured)
@@ -738,18 +716,10 @@ def refined_points(
 ) -> tuple[Views, Float, str | None]:
     """Estimate the points of one person in moving cameras without pictures and with right clocks.
 
-    There `auto` is `refined`, and `robust` where that is refused.
-
-    Args:
-        views: N = T * J joint-frames, joints fastest; one row of poses for each of the T times. The pose
-            noise in them is for `robust`.
-        t_s: [T] strictly increasing.
-        joints: the J names.
-        models: pose noise, the same for every camera; an empty list for exact poses.
-
-    Returns:
-        The views with the estimated noise of keypoints, and with corrected poses where the method corrects
-        them; points [N, 3] m, NaN for none; and the reason of the fallback to `robust`, None without one.
+    There `auto` is `refined`, and `robust` where that is refused. Views are N = T * J joint-frames, joints
+    fastest, with a row of poses for each of the T times; `models` are the pose noise of every camera. Return
+    the views with estimated noise and corrected poses, points [N, 3] m (NaN: none), and the reason of a
+    fallback.
     """
     times, cameras = views.position.shape[:2]
     noisy = replace(views, pixel_sigma=estimate_noise(views))

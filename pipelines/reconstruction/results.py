@@ -75,18 +75,8 @@ def assess(
 ) -> dict[str, Any]:
     """Compute every figure of metrics.json and of the tables of joints and bones.
 
-    Args:
-        observations: the triangulated observations.
-        views: the same, one row for each joint-frame.
-        result: their triangulation.
-        cameras: names of the cameras.
-        method: name of the triangulation method.
-        truth: [T, P', J, 3] the true joints at the same times, in any order of people.
-        solve: the same triangulation, for the runs that leave one camera out.
-
-    Returns:
-        The figures. Errors, shape and shares are those of measured joints; filled joints have their own
-        figure, `filled_mpjpe_mm`.
+    `truth` [T, P', J, 3] has people in any order; `solve` is the same triangulation, for the runs that leave
+    one camera out. Figures are those of measured joints; filled joints have `filled_mpjpe_mm`.
     """
     shape = observations.confidence.shape[:3]
     status = result.status.reshape(shape)
@@ -126,18 +116,10 @@ def assess(
 def of_people(
     names: Sequence[str], observations: Observations, result: Triangulation, truth: Float | None
 ) -> dict[str, Any]:
-    """Compute the figures of each person, and with truth who was missed and confused.
+    """Compute the figures `by_person`, and with truth who was missed and confused; `tracking` else None.
 
-    Args:
-        names: of the reconstructed people.
-        observations: the triangulated observations.
-        result: their triangulation.
-        truth: as in `assess`.
-
-    Returns:
-        `by_person`: for each name the `coverage` (share of the times with any measured joint), the
-        `reconstructed_share` of joint-frames, and with truth the `mpjpe_mm`, `misses`, `switches` and
-        `phantoms`; `tracking`: see `tracking_errors`, None without truth.
+    The `coverage` is the share of the times with any measured joint, the `reconstructed_share` one of
+    joint-frames.
     """
     shape = observations.confidence.shape[:3]
     ok = result.status.reshape(shape) == _OK
@@ -338,18 +320,9 @@ def method_used(
 ) -> dict[str, Any]:
     """Say which parts of a method took part in a reconstruction, which not, and why.
 
-    Args:
-        metrics: the figures of `background`, `refinement`, `clock_offsets_s` and `clock_offset_sigmas_s`,
-            where there are any.
-        cameras: all of them, as loaded.
-        known: "stated" or "logged", the source of the pose noise; None without any.
-        method: as asked for.
-
-    Returns:
-        `background` and `ground`: the cameras whose poses they corrected, and the `reason` of each other;
-        `clocks`: the cameras whose clocks were estimated; `body`: whether motion and bones took part, and
-        the `reason` if not; `pose_noise`: stated, logged, estimated, assumed (of a
-        single camera), or none; `summary`: all that in a line.
+    `background` and `ground`: the cameras whose poses they corrected, and the `reason` of each other;
+    `clocks`: cameras whose clocks were estimated; `body`: motion and bones; `pose_noise`: stated, logged
+    (`known`), estimated, assumed (of a single camera), or none; `summary`: all that in a line.
     """
     used: dict[str, Any] = {}
     entries = metrics.get("background") or {}
@@ -418,17 +391,7 @@ _OF_TRIALS = (
 
 
 def summary_of_trials(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) -> dict[str, Any]:
-    """Summarise all trials for metrics.json.
-
-    Args:
-        text: the errors, as users write them.
-        seed: seed of the draws, and of the resampling of trials.
-
-    Returns:
-        JSON-able, null for figures that could not be measured: `each` trial's figures, their `mean`, `std`
-        (about the mean, n - 1) and the `intervals` of `geometry.metrics` over trials; both null for less
-        than two trials.
-    """
+    """Summarise all trials for metrics.json: `each`, `mean`, `std` (n - 1), `intervals`; null for none."""
     each = [_figures_of_trial(trial) for trial in metrics]
     mean: dict[str, float | None] = {}
     std: dict[str, float | None] = {}
@@ -465,16 +428,7 @@ def _figures_of_trial(metrics: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def write_figures(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[str]) -> dict[str, Any]:
-    """Write metrics.json, and what it would say of each joint and bone as tables beside it.
-
-    Args:
-        folder: the folder of the stage, with skeleton.parquet.
-        figures: those of `assess` and more, JSON-able.
-        guessed_lenses: cameras whose focal length is a guess.
-
-    Returns:
-        The content of metrics.json.
-    """
+    """Write metrics.json, which is returned, and what it says of each joint and bone as tables beside it."""
     shape, intervals_of = figures["shape"], figures["intervals"]
     write_table(
         folder / "joint_errors.parquet",
@@ -596,14 +550,8 @@ def own_covariance(views: Views, result: Triangulation, rows: slice, scale: floa
     """Compute the covariance [N, 3, 3] m^2 of joints relative to the other joints of the person.
 
     It is that of the pixels of their inlier views, scaled by the residuals. The stored covariance counts
-    errors of camera poses, too, which move all joints of a picture together. It is returned where it is the
-    smaller one, or fewer than two views are inliers (filled).
-
-    Args:
-        views: the views of all joint-frames.
-        result: their triangulation.
-        rows: the N joint-frames.
-        scale: ratio of the residuals to `views.pixel_sigma`.
+    errors of camera poses, too, which move all joints of a picture together. It is returned where it is
+    smaller, or fewer than two views are inliers (filled).
     """
     whole = result.covariance[rows]
     index, points = views.pose_index[rows], result.points[rows]
@@ -701,15 +649,9 @@ USUAL_SHARE = 0.9
 def verdict(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[str]) -> dict[str, Any]:
     """Judge a reconstruction without truth.
 
-    Args:
-        folder: of the stage, with skeleton.parquet.
-        figures: those of metrics.json.
-        guessed_lenses: cameras whose focal length is a guess.
-
-    Returns:
-        `grade`: `good`, `usable`, `poor`, or `wrong` where the flight is doubted; `expected_error_mm`: the
-        80 % interval of MPJPE with its median between, None where nothing was measured; `why`: what holds the
-        result back, most important first; `next`: the next command.
+    `grade`: `good`, `usable`, `poor`, or `wrong` where the flight is doubted; `expected_error_mm`: the 80 %
+    interval of MPJPE with its median between, None where nothing was measured; `why`: what holds the result
+    back, most important first; `next`: the next command.
     """
     table = parquet.read_table(folder / "skeleton.parquet", columns=["cxx", "cyy", "czz", "status"])
     variance = sum(table[name].to_numpy() for name in ("cxx", "cyy", "czz"))

@@ -33,16 +33,8 @@ from pipelines.session.errors import NoViewsError
 def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_sigma: float) -> Float:
     """Compute the standard deviation [T, C] rad of a viewing ray, accurate enough to associate people.
 
-    The distance to the actor is not known yet. The distance to the middle of the cameras replaces it,
-    because they surround the actor.
-
-    Args:
-        cameras: C of them.
-        t_ns: [T].
-        position: [T, C, 3] m of the cameras, NaN without a pose.
-        pixel_sigma: standard deviation of a good keypoint (px).
-
-    DataError: no camera has a pose at any time.
+    The distance to the actor is not known yet: that to the middle of the cameras replaces it, because they
+    surround the actor. DataError: no camera has a pose at any time.
     """
     posed = ~np.isnan(position[..., 0])
     if not posed.any():
@@ -157,12 +149,8 @@ _ROUNDS = 12
 def triangulate_heavy_tailed(views: Views) -> Triangulation:
     """Triangulate with `robust`, then weigh its inliers by Cauchy's loss (iteratively reweighted).
 
-    A view of whitened residual r gets the weight 1 / (1 + r^2) (Holland and Welsch 1977, table 1, with
-    the scale `views.pixel_sigma` instead of their tuning constant). `robust` decides which views are
-    inliers; the covariance is that of the weights in the last round.
-
-    Args:
-        views: the views; `pixel_sigma` from `estimate_noise`.
+    A view of whitened residual r gets the weight 1 / (1 + r^2) (Holland and Welsch 1977, table 1), with the
+    scale of `estimate_noise` in place of their tuning constant. The covariance is that of the last weights.
     """
     first = triangulate(views, method="robust")
     inliers = np.where(first.inlier, views.weight, 0.0)
@@ -207,20 +195,11 @@ def position_sigma_m(errors: PoseErrors | None) -> float:
 def placed_by_size(
     joints: Sequence[str], found: Candidates, stated_m: Sequence[float], hips: Float | None, stature_m: float
 ) -> Float:
-    """Estimate lasting position errors so large that rays of different cameras do not meet at all.
+    """Estimate lasting position errors so large that rays of different cameras do not meet at all: [C, 3] m.
 
     Each camera by itself sees the person as far away as the person is tall in its pictures. The places that
-    cameras see are brought together, each camera by as much as its stated error allows.
-
-    Args:
-        joints: names of the J joints.
-        found: detections at T times by C cameras with attitudes that are known.
-        stated_m: [C] standard deviations of their positions' lasting errors.
-        hips: [T, 3] m of a logged person; None without.
-        stature_m: the person's.
-
-    Returns:
-        Shifts [C, 3] m of the positions; 0 where the places agree.
+    cameras see, and `hips` [T, 3] of a log, are brought together, each by as much as its stated error [C] m
+    allows.
     """
     nothing = np.zeros((len(stated_m), 3))
     if not {"nose", "left_ankle", "right_ankle"} <= {*joints}:

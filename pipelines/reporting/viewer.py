@@ -244,13 +244,7 @@ class _PackedBody:
 
 
 def _packed_skin(bodies: Sequence[MovingBody], t_ns: Int64, middle: Float) -> dict[str, object]:
-    """Return the surfaces of people as JSON: few triangles once, and their bones at times [T].
-
-    Args:
-        bodies: of people.
-        t_ns: [T].
-        middle: [T, P, 3] m, of the people's joints, from which centres of bones count.
-    """
+    """Return the surfaces of people at times [T] as JSON; centres of bones count from `middle` [T, P, 3] m."""
     vertices, triangles = body_model().simplified(SKIN_CELL)
     packed = []
     for body in bodies:

@@ -55,12 +55,9 @@ def orbit(
     """Compute the poses of cameras on a ring around a target [T, 3] m; every camera looks at it.
 
     The slots of Ho et al., "3D Human Reconstruction in the Wild with Collaborative Aerial Cameras": yaw_i =
-    yaw + i 2 pi/n (pi/2 for two cameras, which must not face each other), position = target + range (cos yaw
-    cos tilt, sin yaw cos tilt, sin tilt). Yaw is that of the first camera at time 0, counterclockwise from
-    east. At `variation` 1 each camera strays by 10 degrees of yaw, 1 m of range and 3 degrees of tilt, by
-    sines of its own periods.
-
-    Returns positions [N, T, 3] and world_from_camera [N, T, 4] (xyzw), upright pictures.
+    yaw + i 2 pi/n (pi/2 for two), from east, of the first camera at time 0. At `variation` 1 each camera
+    strays by 10 degrees of yaw, 1 m of range and 3 degrees of tilt, by sines of its own periods. Return
+    positions [N, T, 3] and upright world_from_camera [N, T, 4] (xyzw).
     """
     spacing = np.pi / 2 if cameras == 2 else 2 * np.pi / cameras
     camera = np.arange(cameras)[:, None]

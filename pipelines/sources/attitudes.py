@@ -108,24 +108,11 @@ def turned_by_pictures(
     note: Callable[[str], None],
     progress: Progress,
 ) -> TurnedByPictures:
-    """Find the attitudes of a camera by its film.
+    """Find the attitudes of a camera by its film; DataError: the film and the places do not determine them.
 
-    Args:
-        place: the camera in the manifest, for messages.
-        name: name of the camera.
-        film: its pictures.
-        frames: their times.
-        intrinsics: its lens.
-        places: its logged places; logged rotations are only compared, NaN for none.
-        refine_focal: the focal length is a guess, and is refined where the pictures determine it.
-        pose_noise: noise models of the manifest.
-        satellite_sigma_m: standard deviation of satellite positions; None for positions of another kind.
-        kept: returns the map of an earlier ingest by its key, if there is one.
-        note: receives one line on the result.
-        progress: receives the progress over key pictures.
-
-    Raises:
-        DataError: the film and the places do not determine the attitudes.
+    Logged rotations of `places` are only compared, NaN for none. A guessed focal length is refined where the
+    pictures determine it. `satellite_sigma_m` is None for positions of another kind; `kept` returns the map
+    of an earlier ingest by its key; `note` receives one line on the result.
     """
     rows = key_rows(frames.pts_ns)
     numbers = frames.frame[rows].tolist()
