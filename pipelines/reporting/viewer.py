@@ -244,7 +244,7 @@ class _PackedBody:
 
 
 def _packed_skin(bodies: Sequence[MovingBody], t_ns: Int64, middle: Float) -> dict[str, object]:
-    """Return the surfaces of people at times [T] as JSON; centres of bones count from `middle` [T, P, 3] m."""
+    """Return surfaces of people at times [T] as JSON; bones count from `middle` [T, P, 3] m."""
     vertices, triangles = body_model().simplified(SKIN_CELL)
     packed = []
     for body in bodies:
