@@ -165,9 +165,10 @@ def detect(
     counts = _assemble(run.folder, media, blocks, folders)
     lost = {name: camera["undecoded"] for name, camera in counts.items()}
     if not any(camera["detections"] for camera in counts.values()):
-        undecoded = f": {sum(lost.values())} of {pictures} cannot be decoded" if any(lost.values()) else ""
-        problem = f"nobody was found in any picture{undecoded}"
-        remedy = "look at the pictures, or give keypoints"
+        undecoded = f" ({sum(lost.values())} cannot be decoded)" if any(lost.values()) else ""
+        films = ", ".join(Path(source).name for each in media.values() for source in each.sources)
+        problem = f"nobody was found in {pictures} pictures of {films}{undecoded}"
+        remedy = "look if these are films of the flight, try a detector of `mocap models`, or give keypoints"
         raise DataError(session.folder, problem, remedy, code="nobody-found")
     joints = list(read_json(folders[0] / "counts.json")["joints"])
     rows = {name: list(work.span(name)) for name in media}

@@ -139,7 +139,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=32)
+RECONSTRUCT = Stage("reconstruct", revision=33)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 # Detectors place joints in sharp pictures of this size to about three pixels.

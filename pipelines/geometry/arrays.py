@@ -29,9 +29,9 @@ COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5,
 # Over the picture's width. A fisheye lens of 220 deg whose circle is half as wide as the picture has 0.13.
 MIN_FOCAL_SHARE = 0.05
 
-# Principal points of whole pictures lie nearer to the middle, as a share of the sides. That of a picture of
-# half the size is off by a quarter.
-FAR_OFF_CENTRE = 0.2
+# Of the sides: principal points of whole pictures lie nearer to the middle (a few per cent), and those of
+# calibrations of another usual size (3/4, 2/3, 1/2 of it) farther.
+FAR_OFF_CENTRE = 0.1
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,6 @@ from pipelines.sources.parts import CameraFrames
 # So many frames last 18 hours at 30 Hz: a larger number was misread from a date.
 MAX_FRAMES = 2_000_000
 
-# Of the picture's sides: cameras' principal points lie nearer to the middle (a few per cent), while
-# pictures of another usual size (3/4, 2/3, 1/2 of it) have their middle further off.
-MAX_CENTRE_OFFSET = 0.1
-
 # Shares of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. But if the
 # pictures have another size, keypoints lie beyond the right and the lower border only: all begin at 0.
 MAX_SHARE_BEYOND = 0.2
@@ -274,7 +270,7 @@ def _with_size(intrinsics: Intrinsics, size: tuple[int, int] | None, source: Pat
         problem = "states no picture size, and no video does"
         raise DataError(source, problem, "add the size to the calibration", code="wrong-size")
     sized = replace(intrinsics, width=size[0], height=size[1])
-    if sized.off_centre > MAX_CENTRE_OFFSET:
+    if sized.off_centre > FAR_OFF_CENTRE:
         problem = (
             f"has its principal point at {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px, which is not the middle"
             f" of pictures of {size[0]} x {size[1]} px"

@@ -174,15 +174,21 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
 
 
 def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | None:
-    """Return the flight with the less odd person; the first if they are alike."""
+    """Return the flight with the less odd person; the first if they are alike.
+
+    Where most detections of both are others, the prominent person is not the one who was logged.
+    """
     if chosen is None or prominent is None:
         return None
-    same = all(
-        np.array_equal(one.pixels, other.pixels, equal_nan=True)
-        for one, other in zip(chosen.cameras, prominent.cameras, strict=True)
+    one, other = (
+        np.concatenate([camera.pixels.reshape(-1, 2) for camera in flight.cameras])
+        for flight in (chosen, prominent)
     )
-    if same:
+    if np.array_equal(one, other, equal_nan=True):
         return chosen
+    both = np.isfinite(one + other)
+    if both.any() and np.mean(one[both] != other[both]) > 0.5:
+        prominent = prominent._replace(hips=None)
     return min(chosen, prominent, key=lambda flight: score(flight, scene_of(flight)).total)
 
 

@@ -483,6 +483,7 @@
 
   /** Draw the sides of a surface that face the eye, far ones first; `place` gives x, y and depth of a vertex. */
   function drawSkin(context, vertices, place, alpha) {
+    if (!context.canvas.width) return; // on a tab that is not shown
     const placed = vertices.map(place);
     const shownOnes = [];
     for (let f = 0; f < skin.triangles.length; f += 3) {
