@@ -337,10 +337,7 @@ class _DetectionOrder:
 
 
 def detect_block(order: _DetectionOrder) -> dict[str, bytes]:
-    """Detect on a worker; return the files of the block.
-
-    DataError: the worker has no such session, pictures or models, or others.
-    """
+    """Detect on a worker; return a block's files. DataError: its session, pictures or models differ."""
     folder = order.session.opened()
     if hashes_of_models(order.detector) != order.models:
         problem = "has other model files on a machine of the Dask cluster, or none"
@@ -478,10 +475,7 @@ class FollowedBlock:
 
 
 def follow_block(order: tuple[SharedSession, FollowedBlock]) -> dict[str, bytes]:
-    """Follow points through the pictures of a block on a worker, and keep stills; return its files.
-
-    DataError: the worker has no such session or pictures, or others.
-    """
+    """Follow the points of a block's pictures on a worker; DataError: its pictures differ."""
     import cv2
     import pandas as pd
 

@@ -70,10 +70,7 @@ class FilmSettings:
 
 
 def film_settings(stated: str) -> tuple[FilmSettings, Path | None]:
-    """Read `HZ[,KEY=VALUE...]`, where a value may hold commas; return the scenario beside the settings.
-
-    ValueError: an unknown key, or a number that is none or out of range.
-    """
+    """Read `HZ[,KEY=VALUE...]`, and the scenario; ValueError: a wrong key or number."""
     rate_hz, *parts = stated.split(",")
     values = {"rate_hz": rate_hz}
     for part in parts:

@@ -205,10 +205,7 @@ def ingest(
 
 
 class _FlightReader:
-    """Reader that stores the parts of one flight and collects doubts as notes.
-
-    It is a context manager that closes the logs.
-    """
+    """Reader that stores the parts of one flight, collects doubts as notes, and closes the logs at the end."""
 
     def __init__(
         self, flight: Manifest, flight_path: Path, session: Path, interpolation: Interpolation
@@ -284,10 +281,7 @@ class _FlightReader:
         return gimbal.axes or self._logs.settings(gimbal.file).axes or self._flight.world.frame
 
     def _read_camera(self, name: str, folder: Path) -> CameraData:
-        """Read everything about one camera, and check the parts against each other.
-
-        A map of its pictures is stored in the folder.
-        """
+        """Read all about one camera, and check the parts; a map of its pictures goes to the folder."""
         camera = self._flight.cameras[name]
         video = self._files.video(camera)
         detections, detector_format = None, ""

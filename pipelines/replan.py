@@ -82,10 +82,7 @@ class Replanned:
 
 
 def settings_of(stated: Sequence[str], **others: Any) -> ReplanSettings:
-    """Make settings of YAML files (docs/planner.md) and of texts KEY=VALUE; of a key the last one counts.
-
-    DataError: a file cannot be read, or a setting is unknown or out of range.
-    """
+    """Make settings of YAML files and of texts KEY=VALUE, the last one counts; DataError: one is wrong."""
     values: dict[str, object] = {}
     source: Path | str = "--config"
     for one in stated:
@@ -169,10 +166,7 @@ def replan(
 
 
 def refuse_name(name: str | None) -> None:
-    """Refuse a name that cannot be a folder of its own among the tables and those of the arms.
-
-    DataError: it cannot.
-    """
+    """Refuse, with a DataError, a name that cannot be a folder of its own among those of tables and arms."""
     if name is None:
         return
     if not _NAME.fullmatch(name) or name.casefold().endswith(_ENDINGS):

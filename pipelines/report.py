@@ -236,10 +236,7 @@ def write_figures_of(
 
 
 def read_study(folder: Path) -> StudyContent:
-    """Read the result of `mocap study` in a folder.
-
-    DataError: it holds no study, or a damaged one.
-    """
+    """Read the result of `mocap study` in a folder; DataError: it holds none, or a damaged one."""
     remedy = "name a folder that `mocap study ... -o FOLDER` wrote"
     if not (folder / STUDY_MARK).is_file():
         raise DataError(folder, f"holds no study (no {STUDY_MARK})", remedy, code="wrong-kind")
@@ -320,10 +317,7 @@ def _read_frame(pictures: dict[str, CameraPictures], camera: str, frame: int) ->
 
 
 def content_of(folder: Path) -> SessionContent:
-    """Load all that the page of a session shows.
-
-    DataError: not a session, or damaged; a table of it was changed.
-    """
+    """Load all that the page of a session shows; DataError: not a session, damaged, or a changed table."""
     records = _finished_stages(open_session(folder))
     return _load(folder, read_description(folder), records)
 

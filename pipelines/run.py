@@ -69,10 +69,7 @@ def _ingested(manifest: Path, progress: Progress) -> tuple[Ingested, list[str]]:
 
 
 def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[str]]:
-    """Return the manifest of a folder, and what it assumes if it was drafted now (see `must_be_drafted`).
-
-    DataError: the folder holds no flight, or something is missing that only the user knows.
-    """
+    """Return a folder's manifest, and what a draft assumes; DataError: no flight, or it lacks something."""
     manifest = folder if folder.suffix in {".yaml", ".yml"} else folder / MANIFEST
     if folder.is_file() and manifest != folder:
         problem = "is no folder and no flight.yaml"

@@ -375,10 +375,7 @@ _PART = re.compile(r"(.*)_(\d{1,9})", re.DOTALL)
 
 
 def join_parts(recordings: Sequence[FoundLog]) -> list[FoundLog]:
-    """Join files named NAME_0, NAME_1, ... to one recording, if each begins after the previous one ends.
-
-    Two drones that log at the same time stay two recordings.
-    """
+    """Join NAME_0, NAME_1, ... to one recording if each begins after the one before: two drones stay two."""
     result: list[FoundLog] = []
     for recording in sorted(recordings, key=lambda each: _part(each.place)):
         before = result[-1] if result else None

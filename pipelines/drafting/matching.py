@@ -371,10 +371,7 @@ def _pair_by_content(
     gimbals: Sequence[Proposal],
     compare: Compare,
 ) -> None:
-    """Give videos without poses those that no camera has, by time, else by motion.
-
-    Motion also tells when the video began.
-    """
+    """Give videos without poses those that no camera has, by time, else by motion, which tells the start."""
     taken = _taken(cameras)
     likeliest: dict[object, Proposal] = {}  # of several topics of one drone
     for candidate in moving:
@@ -439,10 +436,7 @@ def _ask_for_the_rest(
     compare: Compare,
     ask: Ask,
 ) -> None:
-    """Ask for poses, intrinsics and the reference of a gimbal that neither names nor contents tell.
-
-    What explains the motion in its pictures best is the likeliest.
-    """
+    """Ask for what neither names nor contents tell; what explains the motion in the pictures is likeliest."""
     film, taken = camera.film, [c.choices["pose"].taken for c in cameras if "pose" in c.choices]
     free = [c for c in moving if c not in taken and (film is None or _may_be_of(film, c))]
     for key, candidates in (("pose", free), ("intrinsics", intrinsics)):

@@ -51,10 +51,7 @@ FARTHEST_M = 1e9
 
 
 def find_poses(text: str) -> tuple[Heading, dict[str, int]] | None:
-    """Find the heading of a table of poses, and the columns x, y, z, qx, qy, qz, qw and any of c00..c55.
-
-    It is the first line that is no comment, or a comment whose cells are separated by more than spaces.
-    """
+    """Find the heading of a table of poses, maybe a comment, and the columns x to qw and c00..c55."""
     for index, line in enumerate(text.split("\n", 100)[:100]):
         stripped = line.strip()
         if not stripped:

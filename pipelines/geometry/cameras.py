@@ -35,10 +35,7 @@ def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
 
 
 def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
-    """Compute the viewing rays x/z, y/z [..., 2] of pixels [..., 2], to 1e-10 (relative above 1).
-
-    NaN for pixels that are NaN or that no ray within the model's valid radius reaches.
-    """
+    """Compute rays x/z, y/z [..., 2] of pixels [..., 2] to 1e-10; NaN where the model has no ray."""
     distorted = (pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
     flat = distorted.reshape(-1, 2)
     normalised = np.full_like(flat, np.nan)
@@ -49,18 +46,12 @@ def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
 
 
 def row_delay_s(row_px: Float, intrinsics: Intrinsics) -> Float:
-    """Compute how much later than the picture's stamp, its middle row's, a rolling shutter takes a row.
-
-    `row_px` [...] counts from the centre of the first row, which is read first; NaN stays.
-    """
+    """Compute how much later than the middle row a rolling shutter takes rows [...] px; NaN stays."""
     return (row_px / max(intrinsics.height - 1, 1) - 0.5) * intrinsics.readout_s
 
 
 def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
-    """Return the intrinsics for pictures resized to `width` x `height`.
-
-    The corners of the picture stay corners: they lie half a pixel outside the centres of the corner pixels.
-    """
+    """Return the intrinsics for resized pictures; corners, half a pixel beyond centres, stay corners."""
     sx, sy = width / intrinsics.width, height / intrinsics.height
     return replace(
         intrinsics,

@@ -41,10 +41,7 @@ _OPTIONS = {
 
 
 def helper(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Compile a function that only compiled functions call; it becomes part of them.
-
-    Without the wrapper for calls from Python, it compiles in three quarters of the time.
-    """
+    """Compile a function that compiled ones alone call: no wrapper for Python, 3/4 of the time."""
     compiled: Callable[Arguments, Result] = numba.njit(function, no_cpython_wrapper=True, **_OPTIONS)
     return compiled
 
@@ -79,10 +76,7 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 
 
 def _with_cache(function: Callable[Arguments, Result], options: dict[str, Any]) -> Any:
-    """Make numba's compiler of a function with a cache, for temporary files if need be.
-
-    RuntimeError: there is no place for a cache.
-    """
+    """Make numba's compiler with a cache, else among temporary files; RuntimeError: there is no place."""
     try:
         return numba.njit(function, cache=True, **options)
     except RuntimeError:

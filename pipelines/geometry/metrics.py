@@ -161,10 +161,7 @@ def common(*estimates: Float) -> Bool:
 
 
 def bone_lengths(position: Float, joints: Sequence[str], bones: Sequence[tuple[str, str]]) -> Float:
-    """Compute lengths [T, P, B] in m of bones between named joints; NaN where either end is missing.
-
-    ValueError: a bone ends at a joint that is not in `joints`.
-    """
+    """Compute lengths [T, P, B] m of bones, NaN where an end is missing; ValueError: an unknown joint."""
     unknown = sorted({end for bone in bones for end in bone} - set(joints))
     if unknown:
         raise ValueError(f"bones end at {', '.join(unknown)}, which the skeleton does not have")
@@ -369,10 +366,7 @@ class Alignment:
 
 
 def align_each(source: Float, target: Float, *, with_scale: bool) -> Alignment:
-    """Align many pairs of point sets [..., J, 3], each pair separately, without NaN points.
-
-    The result is NaN where fewer than 3 points are common or they lie on a line.
-    """
+    """Align pairs of point sets [..., J, 3] without NaN points; NaN for fewer than 3, or on a line."""
     present = (np.isfinite(source) & np.isfinite(target)).all(axis=-1, keepdims=True)
     count = present.sum(axis=-2)
     divisor = np.maximum(count, 1)

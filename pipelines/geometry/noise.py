@@ -35,10 +35,7 @@ Frame = Literal["world", "body"]
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseModel(ABC):
-    """One kind of pose error; the fields are the parameters that users write.
-
-    ValueError: a number is negative or not finite, or `frame` is neither world nor body.
-    """
+    """One kind of pose error, of the parameters that users write; ValueError: one is out of range."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -132,10 +129,7 @@ class Bias(_Stationary):
 
 @dataclass(frozen=True, kw_only=True)
 class GaussMarkov(_Stationary):
-    """An error that decorrelates with a correlation time, like that of satellite positioning.
-
-    The autocorrelation is exp(-lag / correlation_s) (Gelb 1974, Applied Optimal Estimation, 3.8).
-    """
+    """An error with the autocorrelation exp(-lag / correlation_s) (Gelb 1974, 3.8), as of satellites."""
 
     correlation_s: float
 
@@ -210,10 +204,7 @@ class Latency(NoiseModel):
 def sum_sigma(
     models: Sequence[NoiseModel], elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float
 ) -> Float:
-    """Compute the standard deviation [T, 2] per axis (m, rad) of the sum of models; 0 without any.
-
-    The models are independent.
-    """
+    """Compute the standard deviation [T, 2] per axis (m, rad) of the sum of independent models."""
     variance = np.zeros((len(elapsed_s), 2))
     for model in models:
         variance += model.marginal_sigma(elapsed_s, speed_mps, turn_rate_radps) ** 2
@@ -384,18 +375,12 @@ def errors_of_level(level: Float) -> PoseErrors:
 def build(
     parts: Iterable[tuple[str, Mapping[str, object]]], classes: Mapping[str, type[NoiseModel]]
 ) -> list[NoiseModel]:
-    """Build noise models from names and parameters: `pose_noise.items()` of a flight, or `parse(text)`.
-
-    ValueError: an unknown model or parameter (the message lists the known ones), a missing or wrong one.
-    """
+    """Build noise models of names and parameters; ValueError: an unknown one, a missing or wrong value."""
     return [_build_one(name, parameters, classes) for name, parameters in parts]
 
 
 def parse(text: str) -> list[tuple[str, dict[str, object]]]:
-    """Parse names and parameters of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
-
-    ValueError: the text does not have that form.
-    """
+    """Parse `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`; ValueError for another form."""
     # The sign of an exponent (1e+3) does not start another model: a digit follows directly.
     return [_parse_one(part.strip()) for part in re.split(r"\+(?!\d)", text)]
 

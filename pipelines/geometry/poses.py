@@ -33,10 +33,7 @@ def matrix_from_quaternion(quaternion_xyzw: Float) -> Float:
 
 
 def quaternion_from_matrix(matrix: Float) -> Float:
-    """Convert rotation matrices [..., 3, 3] to unit quaternions [..., 4], with w >= 0.
-
-    Shepperd 1978: of the four possible divisions, the one by the largest component is used.
-    """
+    """Convert [..., 3, 3] to unit quaternions [..., 4], w >= 0 (Shepperd 1978: divide by the largest)."""
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
@@ -124,10 +121,7 @@ def transform(target_from_source: tuple[Float, Float], points: Float) -> Float:
 
 
 def look_at(position: Float, target: Float) -> Float:
-    """Compute world_from_camera [..., 4], w >= 0, of upright cameras that look at a point.
-
-    A camera exactly above it has north up in its picture.
-    """
+    """Compute world_from_camera [..., 4] of upright cameras that look at a point; from above north is up."""
     forward = target - position
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     right = np.stack([forward[..., 1], -forward[..., 0], np.zeros(forward.shape[:-1])], axis=-1)
@@ -168,10 +162,7 @@ def interpolate_poses(
 
 
 def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: int) -> Float:
-    """Interpolate values [N, ...] between strictly increasing stamps linearly; exact at a stamp.
-
-    NaN outside them, in gaps longer than `max_gap_ns`, and where a neighbour is missing.
-    """
+    """Interpolate values [N, ...] linearly; NaN outside, in longer gaps, and where a neighbour is missing."""
     between = _bracket(t_ns, at_ns, max_gap_ns, 0)
     if not len(t_ns):
         return np.full((len(at_ns), *values.shape[1:]), np.nan)
@@ -196,10 +187,7 @@ def velocities(t_s: Float, values: Float, follows: Bool) -> tuple[Float, Float]:
 
 
 def rates(t_ns: Int64, position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
-    """Compute speed [N] in m/s and turn rate [N] in rad/s at each stamp, from its neighbours.
-
-    Both are 0 for a single pose.
-    """
+    """Compute speed [N] m/s and turn rate [N] rad/s at each stamp, from its neighbours; 0 for one pose."""
     if len(t_ns) < 2:
         return np.zeros(len(t_ns)), np.zeros(len(t_ns))
     step_s = np.diff(t_ns) / 1e9
@@ -277,10 +265,7 @@ _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 def carried_covariance(
     covariance: Float, *, position_xyzw: Float = _NO_TURN, rotation_xyzw: Float = _NO_TURN, scale: float = 1.0
 ) -> Float:
-    """Transform covariances [..., 6, 6] of poses by rotations of the axes of positions and of rotations.
-
-    Positions are then scaled.
-    """
+    """Turn the axes of positions and rotations in covariances [..., 6, 6] of poses; then scale positions."""
     turns = (matrix_from_quaternion(each) for each in (position_xyzw, rotation_xyzw))
     of_position, of_rotation = np.broadcast_arrays(*turns)
     jacobian = _block_diagonal(of_rotation)
@@ -386,10 +371,7 @@ def chain(
 
 
 def find_route(edges: Collection[tuple[str, str]], parent: str, child: str) -> Route:
-    """Find the shortest path from one frame to another, breadth first; alphabetical among equal lengths.
-
-    ValueError: as in `chain`.
-    """
+    """Find the shortest path between frames, alphabetical among equal ones; ValueError: as in `chain`."""
     neighbours: dict[str, set[str]] = {}
     for target, source in edges:
         neighbours.setdefault(target, set()).add(source)

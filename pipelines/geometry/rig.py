@@ -114,10 +114,7 @@ def sole_points(rig: Rig, motion: BodyMotion) -> Float:
 
 
 def about(axis: int, angle: Float) -> Float:
-    """Return rotations [T, 4] about x, y or z (0, 1, 2) by [T] rad.
-
-    y turns forward (x) down, z turns to the left.
-    """
+    """Return rotations [T, 4] about x, y or z (0, 1, 2) by [T] rad; y turns x down, z to the left."""
     turned = np.zeros((len(angle), 4))
     turned[:, axis] = np.sin(angle / 2)
     turned[:, 3] = np.cos(angle / 2)

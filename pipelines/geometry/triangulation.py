@@ -358,10 +358,7 @@ def estimate_noise(views: Views) -> Float:
 
 
 def residual_sigma(views: Views, result: Triangulation, least_px: Float) -> Float:
-    """Compute the pixel noise per axis [C] that gives the inliers their expected median.
-
-    It is at least `least_px`.
-    """
+    """Compute pixel noise per axis [C], at least `least_px`, that gives inliers their expected median."""
     seen = np.where(result.inlier, views.weight, np.nan)
     variance = views.pixel_sigma**2 + seen**2 * pose_variance_px(views, result.points)  # of confidence 1
     whitened = np.nansum((seen * result.residual_px) ** 2 / variance, axis=1)
@@ -485,10 +482,7 @@ def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float) -> B
 
 
 def _moved(views: Views, picture: Int64, points: Float) -> tuple[Views, Bool]:
-    """Move each view by the median residual of its picture; return also which views [N, C] could be moved.
-
-    The moved views have exact poses. The others count as not seen.
-    """
+    """Move views to exact poses by the median residual of their picture; also mark those moved [N, C]."""
     rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
     place = (rotation.mT @ (points[:, None] - position)[..., None])[..., 0]
     seen: Bool = np.asarray((views.weight > 0) & np.isfinite(views.rays).all(axis=-1))

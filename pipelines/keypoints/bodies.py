@@ -510,10 +510,7 @@ def rays_of(xy: Float, rotation: Float) -> Float:
 
 
 def meeting_points(rays: Float, origin: Float, weight: Float) -> tuple[Float, Float]:
-    """Find the points [..., 3] nearest to rays [..., C, 3] by least squares, and the normal matrices.
-
-    Points are NaN for fewer than two rays and for parallel ones; a unit ray counts where its weight is not 0.
-    """
+    """Find points [..., 3] nearest to unit rays [..., C, 3], NaN if open, and the normal matrices."""
     rays, origin = (np.where(weight[..., None] > 0, of, 0.0) for of in (rays, origin))
     across = weight[..., None, None] * (np.eye(3) - rays[..., :, None] * rays[..., None, :])
     normal = across.sum(axis=-3)

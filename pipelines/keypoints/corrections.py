@@ -417,10 +417,7 @@ class Calibration:
     knots: Mapping[str, Float]
 
     def probability(self, confidence: Float, joints: Sequence[str]) -> Float:
-        """Map confidences [..., J] to probabilities; linear between knots, constant beyond them, NaN stays.
-
-        A confidence of 0 means that nothing was found, and stays 0.
-        """
+        """Map confidences [..., J] to probabilities, linear between knots; NaN and 0 stay."""
         calibrated = np.empty(confidence.shape)
         for column, joint in enumerate(joints):
             knots = self.knots[group_of(joint, self.knots)]

@@ -79,10 +79,7 @@ class OnnxOptions:
 
 
 def parse_options(argument: str) -> OnnxOptions:
-    """Parse the text after the colon; a path may contain commas.
-
-    DataError: an option is unknown, repeated, or has a value out of its range.
-    """
+    """Parse the text after the colon; a path may hold commas. DataError: an unknown or bad option."""
     parts = argument.split(",")
     first = next((i for i, part in enumerate(parts) if i and re.match(r"[a-z_]+=", part)), len(parts))
     given: dict[str, str] = {}
@@ -192,10 +189,7 @@ class OnnxNetwork:
         self.shapes = {name: values.shape for name, values in self.run(blank).items()}
 
     def batch(self, rgb: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-        """Compute the outputs [N, ...], by name, for pictures [N, H, W, 3] of RGB values 0..255, N > 0.
-
-        A graph with a fixed batch runs several times; the last run is padded with zeros.
-        """
+        """Compute outputs [N, ...] for RGB pictures [N, H, W, 3] 0..255; fixed batches are padded."""
         step = self._batch or len(rgb)
         short = -len(rgb) % step
         filled = np.concatenate([rgb, np.zeros((short, *rgb.shape[1:]), np.uint8)])
@@ -282,10 +276,7 @@ _FLOOR = 1e-10
 
 @dataclass(frozen=True)
 class PoseDecoder:
-    """Decoder of one network's outputs: x and y scores, or heatmaps, of `count` joints.
-
-    `per_px` [2] are bins or cells for each pixel of the input, in x and y.
-    """
+    """Decoder of scores in x and y, or heatmaps, of `count` joints, with bins or cells [2] for each pixel."""
 
     outputs: tuple[str, ...]
     count: int
@@ -300,10 +291,7 @@ class PoseDecoder:
 
 
 def decoder_for(network: OnnxNetwork, cells: HeatmapCells) -> PoseDecoder:
-    """Choose the decoder of a network's outputs from their shapes.
-
-    DataError: they are of no known kind.
-    """
+    """Choose the decoder of a network's outputs from their shapes; DataError: they are of no known kind."""
     width, height = network.size
     lines = {name: shape for name, shape in network.shapes.items() if len(shape) == 3}
     if len(lines) == 2 and len({shape[1] for shape in lines.values()}) == 1:
@@ -460,10 +448,7 @@ def _upright_crop(region: Region, size: tuple[int, int]) -> Float:
 
 
 class OnnxPose:
-    """Loaded networks. Not thread-safe.
-
-    Joints beyond `joints` are left out. Without a finder of people only the log gives their place.
-    """
+    """Loaded networks for one thread; without a finder of people only the log gives their place."""
 
     def __init__(
         self, network: OnnxNetwork, decoder: PoseDecoder, joints: tuple[str, ...], people: FindsPeople | None
@@ -555,10 +540,7 @@ class OnnxDetector:
         return {name: path if path is not None and path.is_file() else None for name, path in paths.items()}
 
     def fetch(self, source: Path | None = None) -> None:  # noqa: ARG002  # the protocol's
-        """Refuse: the user's own models cannot be fetched.
-
-        DataError: always.
-        """
+        """Refuse, with a DataError: the user's own models cannot be fetched."""
         raise DataError("onnx", "is your own model", "write --detector onnx:MODEL.onnx")
 
     def load(self, *, threads: int) -> OnnxPose:
@@ -599,10 +581,7 @@ class OnnxFamily:
     usage = USAGE
 
     def configured(self, argument: str) -> OnnxDetector:
-        """Build the detector from a model and its options.
-
-        DataError: the file is missing, or an option is wrong.
-        """
+        """Build the detector from a model and its options; DataError: a missing file, or a wrong option."""
         options = parse_options(argument)
         for path in (options.model, options.people):
             if path is not None and not path.is_file():

@@ -95,10 +95,7 @@ def actor_hints(
     between: Interpolation,
     t_ns: Int64,
 ) -> list[Hint | None]:
-    """Predict the logged actor's hips in a camera's pictures [T]; None where the log or the pose is missing.
-
-    `between` are the rules for interpolating between the logged poses.
-    """
+    """Predict the logged actor's hips in pictures [T]; None where the log or the pose is missing."""
     position, quaternion = poses_at(trajectory, t_ns, between, static=entry.poses.static)
     sigma = hint_sigma(name, entry, trajectory, t_ns)
     intrinsics = entry.intrinsics

@@ -469,10 +469,7 @@ def _detector_side(region: Region) -> float:
 
 
 class FollowedPeople:
-    """Tracker of the people in one camera's pictures, with the J joints wanted; see `PeopleTracker`.
-
-    Joints that the detector does not have are never found.
-    """
+    """Tracker of the people in one camera's pictures; joints unknown to the detector stay NaN."""
 
     def __init__(self, networks: KeypointNetworks, joints: Sequence[str], *, only_one: bool) -> None:
         self._tracker = PeopleTracker(networks, only_one=only_one)

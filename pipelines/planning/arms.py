@@ -75,10 +75,7 @@ class FormationPlanner(Protocol):
 
 @runtime_checkable
 class RollingOut(Protocol):
-    """Formation planner that compares what the local planner would make of several paths.
-
-    Whoever flies the planner sets `roll_out`; without it the planner compares the slots alone.
-    """
+    """Formation planner that compares what is flown of paths, once somebody sets `roll_out`."""
 
     roll_out: RollOut | None
 

@@ -88,10 +88,7 @@ def _ratio(sums: Float, weights: Float, t_ns: Int64 | None = None) -> MeanWithIn
 
 
 def common_frames(errors: Mapping[str, Float32]) -> Bool:
-    """Return the joint-frames [trials, T, J] that every arm measured.
-
-    Arms that measured none do not count.
-    """
+    """Return the joint-frames [trials, T, J] that every arm measured that measured anything."""
     measured = [np.isfinite(error) for error in errors.values() if np.isfinite(error).any()]
     shape = next(iter(errors.values())).shape
     return np.logical_and.reduce(measured) if measured else np.zeros(shape, dtype=np.bool_)
@@ -125,10 +122,7 @@ def figures_of(
 
 
 def capped_mm(measured: MeasuredJoints) -> Float:
-    """Compute the mean error [K] over all joint-frames with a truth, each at most 150 mm (`PCK_M`).
-
-    Joints that were not measured count as 150 mm off, so that missing joints cannot flatter.
-    """
+    """Compute the mean error [K], each at most 150 mm (`PCK_M`), as joints count that were not measured."""
     error = np.where(np.isfinite(measured.error_m), measured.error_m, PCK_M).astype(np.float64)
     gained = (PCK_M - np.minimum(error, PCK_M)).sum(axis=(1, 2))
     capped: Float = 1e3 * (PCK_M - gained / max(measured.joint_frames, 1))
@@ -386,10 +380,7 @@ def _with_interval(found: MeanWithInterval | None, scale: float, unit: str) -> s
 
 
 def equal_ranges(range_m: Mapping[str, float]) -> list[list[str]]:
-    """Group arms by their mean ranges, the nearest first: within a group they differ by at most 0.3 m.
-
-    Arms of one group can be compared without the gain of a nearer view.
-    """
+    """Group arms that can be compared without the gain of a nearer view: mean ranges within 0.3 m."""
     groups: list[list[str]] = []
     for name in sorted(range_m, key=lambda name: range_m[name]):
         if groups and range_m[name] - range_m[groups[-1][0]] <= SAME_RANGE_M:

@@ -128,10 +128,7 @@ def _samples_inside(first: float, per: float, size: int, low: float, high: float
 
 @helper
 def look(sight: Sight, x: float, y: float, z: float) -> tuple[int, int]:
-    """Test if the voxel at a place (voxels) is occupied; return 0 or 1, and the leap in half voxels.
-
-    Within the leap all points have the same state.
-    """
+    """Test if the voxel at a place (voxels) is occupied, 0 or 1; all points within the leap are alike."""
     size = sight.size
     i = np.uintp(min(max(int(x), 0), size[0] - 1))
     j = np.uintp(min(max(int(y), 0), size[1] - 1))
@@ -326,10 +323,7 @@ MapsInTurn = Sequence[tuple[slice, DistanceField]]
 
 
 def in_turn(fields: Sequence[DistanceField], t_ns: Int64) -> MapsInTurn:
-    """Return the map that holds at each of the times [T], ascending; space is open before the first one.
-
-    `fields` are in the order of their times.
-    """
+    """Return the map that holds at each time [T], of fields in order; space is open before the first one."""
     starts = np.searchsorted(t_ns, [field.from_ns for field in fields]).tolist()
     ends = [*starts, len(t_ns)][1:]
     parts = [(slice(0, starts[0] if starts else len(t_ns)), open_space())]
@@ -340,10 +334,7 @@ def in_turn(fields: Sequence[DistanceField], t_ns: Int64) -> MapsInTurn:
 def looked(
     maps: DistanceField | MapsInTurn, look: Callable[[DistanceField, slice], NDArray[Any]], *, axis: int
 ) -> NDArray[Any]:
-    """Join what `look` returns for each map and its times along the axis of time.
-
-    A single map holds all the time.
-    """
+    """Join what `look` returns for each map and its times along `axis`; a single map holds all the time."""
     if isinstance(maps, DistanceField):
         return look(maps, slice(None))
     return np.concatenate([look(field, rows) for rows, field in maps], axis=axis)

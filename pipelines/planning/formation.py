@@ -39,10 +39,7 @@ YAW, TILT, RANGE = range(3)
 
 
 def spacing_rad(drones: int) -> float:
-    """Return the yaw between neighbours: equal parts of a turn, but 90 deg for two.
-
-    Two cameras must not face each other.
-    """
+    """Return the yaw between neighbours: equal parts of a turn, 90 deg for two, not to face each other."""
     return np.pi / 2 if drones == 2 else 2 * np.pi / drones
 
 
@@ -75,10 +72,7 @@ def wrapped(angle_rad: Float) -> Float:
 
 
 def yaw_set(yaws: int, start_rad: float) -> Float:
-    """Return equidistant yaws [D] over -pi..pi, half open, one of them the yaw of the start.
-
-    So a formation without a reason to turn stays exactly at its first yaw.
-    """
+    """Return equidistant yaws [D] over -pi..pi with the start's: nothing turns without a reason."""
     turns = np.arange(yaws, dtype=np.float64) / yaws
     return np.sort(wrapped(start_rad + 2 * np.pi * turns))
 

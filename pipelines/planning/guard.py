@@ -120,10 +120,7 @@ class Guard:
     def admit(
         self, drone: int, t_s: float, plan: DronePlan, actor: ActorFilter | PeopleFilter, field: DistanceField
     ) -> DronePlan:
-        """Commit a drone to the best safe motion, and return the plan that is flown.
-
-        `plan` is the local planner's, from the drone's place and now.
-        """
+        """Commit a drone to the best safe motion for the local `plan`; return the plan that is flown."""
         after_s = self._flying.period_s * np.arange(self._states.shape[1], dtype=np.float64)
         around = _Around(field, self._others(drone), actor.each(t_s + after_s))
         place = self._states[drone, self._age[drone], POSITION]

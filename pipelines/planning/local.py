@@ -584,10 +584,7 @@ class LocalPlanner:
         others: Float,
         field: DistanceField,
     ) -> tuple[float, dict[str, float], Float]:
-        """Compute the cost of waypoints [N, 3]: in total, its unweighted terms, and the gradient [N, 3].
-
-        `others` [M, N, 3] are the other drones' waypoints; the rest is as in `plan`.
-        """
+        """Compute the cost of waypoints [N, 3]: total, unweighted terms, gradient [N, 3]; as in `plan`."""
         terms, gradient = np.zeros(len(TERMS)), np.zeros_like(waypoints)
         path = _with_start(position, velocity, waypoints, self._config.tuning.waypoint_s)
         total = _evaluate(path, slots, actor, others, field.grid, self._weights_for(field), terms, gradient)

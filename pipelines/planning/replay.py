@@ -411,10 +411,7 @@ def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
 
 
 def measure_arm(scene: ReplayScene, flown: ArmFlight, detect: Detect) -> MeasuredJoints | None:
-    """Simulate what an arm's cameras measure of everybody's skeleton; None without a skeleton.
-
-    It is known which keypoints belong to whom.
-    """
+    """Simulate what an arm's cameras measure of skeletons; it is known which keypoints belong to whom."""
     if scene.joints is None:
         return None
     cameras = scene.flight.cameras

@@ -110,10 +110,7 @@ class LoggedFlight:
         return not all(camera.static for camera in self.cameras)
 
     def scored_actor(self, t_ns: Int64) -> tuple[Float, Source]:
-        """Return the positions [P, T, 3] of the people to score against.
-
-        These are the true hips if they are known all the time.
-        """
+        """Return the positions [P, T, 3] to score against: the true hips if they are known all the time."""
         if self.hips is not None:
             true_hips = points_at(self.hips, t_ns)[:, :, 0]
             if np.isfinite(true_hips).all():
@@ -250,10 +247,7 @@ def walked_otherwise(flight: LoggedFlight, walk: OtherWalk, maps: Sequence[Occup
 
 
 def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> tuple[Float, Float, Bool]:
-    """Interpolate the true poses of the cameras: [N, T, 3], [N, T, 4], and a mask [N, T] of known ones.
-
-    Positions are linear across gaps of the log, so that a flight can be scored as a whole.
-    """
+    """Interpolate the cameras' true poses [N, T, ...], straight across gaps, and mask known ones [N, T]."""
     trusted = description.pose_interpolation
     shape = (len(flight.cameras), len(t_ns))
     position, quaternion = np.empty((*shape, 3)), np.empty((*shape, 4))
@@ -487,10 +481,7 @@ class ReplanSettings:
 
 
 def replan_settings(values: Mapping[str, object], source: Path | str, **others: Any) -> ReplanSettings:
-    """Make settings of a mapping, as from YAML: those of the planner, and `yaw_deg`.
-
-    DataError: a setting is unknown or out of range.
-    """
+    """Make settings of a mapping: those of the planner, and `yaw_deg`; DataError: one is unknown or wrong."""
     planner = dict(values)
     own: dict[str, Any] = {}
     if "yaw_deg" in planner:

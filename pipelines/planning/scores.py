@@ -67,10 +67,7 @@ def ray_information(offset: Float, errors: ErrorModel) -> Float:
 
 
 def predicted_error(information: Float) -> Float:
-    """Compute sqrt(tr S), S = I^-1: the expected error in metres of [..., 3, 3].
-
-    It is inf where a direction is unseen.
-    """
+    """Compute sqrt(tr I^-1), the expected error in m, of [..., 3, 3]; inf where a direction is unseen."""
     minors, determinant = _minors(information)
     with np.errstate(divide="ignore", invalid="ignore"):
         trace = np.sum(minors, axis=-1) / determinant

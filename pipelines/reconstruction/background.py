@@ -391,10 +391,7 @@ def _without(errors: Float, position: Float, rotation: Float) -> tuple[Float, Fl
 
 
 def _sigma_of_constants(prior: PosePrior) -> Float:
-    """Collect the standard deviations [9] of constant errors; [10] with an unknown clock.
-
-    A shift of the whole path causes no residual: the path stays where the log has it.
-    """
+    """Collect standard deviations [9] of constant errors, [10] with a clock; a shift leaves no trace."""
     sigma = np.repeat([0.0, *prior.constant[1:]], 3)
     return np.append(sigma, prior.clock_s) if prior.clock_s > 0 else sigma
 
@@ -812,10 +809,7 @@ def _with_position_levels(prior: PosePrior, white: float, slow: Process) -> Pose
 
 
 def _levels_of_standing(t_s: Float, position: Float) -> tuple[float, float]:
-    """Read the level (m) of white errors and the rate of slow ones (m per sqrt(s)) off a log that stands.
-
-    Differences of neighbours are white errors, and what they grow by over a longer time is slow.
-    """
+    """Read white errors (m) and the rate of slow ones (m per sqrt(s)) off a log that stands."""
     period_s = float(np.median(np.diff(t_s)))
     lag = int(np.clip(round(_SLOW_LAG_S / period_s), 2, len(t_s) // 2))
     near, far = (float(np.mean((position[k:] - position[:-k]) ** 2)) for k in (1, lag))
@@ -825,10 +819,7 @@ def _levels_of_standing(t_s: Float, position: Float) -> tuple[float, float]:
 
 
 def _place_of_standing(t_s: Float, position: Float, prior: PosePrior) -> tuple[Float, float]:
-    """Estimate the place [3] of a camera that stands, and its variance per axis by white and slow errors.
-
-    Each pose of the log is weighted by the covariance of these errors over time (generalised least squares).
-    """
+    """Estimate the place [3] of a camera that stands, and its variance, by generalised least squares."""
     parts = np.array_split(np.arange(len(t_s)), min(len(t_s), _MOST_MEANS))
     at_s = np.array([t_s[part].mean() for part in parts])
     means = np.array([position[part].mean(axis=0) for part in parts])

@@ -45,10 +45,7 @@ class Tracks:
 
 
 def rays_at_stamps(tracks: Tracks, intrinsics: Intrinsics, t_ns: Int64) -> Float:
-    """Compute the viewing rays [K, 2] of followed points at the stamps [T] of their pictures.
-
-    Points of a rolling shutter go on from their rows' times by their own velocities.
-    """
+    """Compute the rays [K, 2] of points at stamps [T]; those of a rolling shutter go on till then."""
     rays = undistort(tracks.xy, intrinsics)
     if not intrinsics.readout_s:
         return rays
@@ -67,10 +64,7 @@ def rays_at_stamps(tracks: Tracks, intrinsics: Intrinsics, t_ns: Int64) -> Float
 
 @dataclass(frozen=True)
 class Followed:
-    """Background of one camera, in parts with points of their own, which are loaded when they are needed.
-
-    A part begins with the last picture of the part before.
-    """
+    """Background of one camera, loaded in parts, each from the last picture of the part before on."""
 
     rows: Int64  # [T] of its frames
     begins: Int64  # [N] first picture of each part; pictures count these rows

@@ -92,10 +92,7 @@ class FoundClocks:
     wrong: Mapping[str, str] = field(default_factory=dict)  # evidence against each stated clock that is moved
 
     def with_others(self, found: FoundClocks) -> FoundClocks:
-        """Add the offsets that keypoints show for cameras that are already shifted by these.
-
-        The standard deviations of these stay.
-        """
+        """Add the offsets that keypoints show for cameras that these already shift; their deviations stay."""
         sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
         wrong = {**found.wrong, **self.wrong}
         return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s, wrong=wrong)

@@ -267,10 +267,7 @@ def _gaps(t_s: Float, there: Bool, max_gap_s: float) -> list[tuple[int, int]]:
 
 
 def _miss(t_s: Float, position: Float, there: Bool, missing: int) -> Float | None:
-    """Compute the mean outer product [3, 3] of interpolation errors in the middle of gaps of that length.
-
-    Returns None if fewer than 4 complete stretches exist.
-    """
+    """Compute the mean outer product [3, 3] of errors mid-gap; None for fewer than 4 stretches."""
     span = missing + 2 * _SIDES
     if len(t_s) < span:
         return None

@@ -219,10 +219,7 @@ def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> tup
 
 
 def with_reference(description: Description, cameras: Sequence[Camera], clock_sigma_s: Float) -> Float:
-    """Hold the clock of the manifest's reference camera where none is known: rays show differences only.
-
-    Returns the standard deviations [C] s, 0 for a clock that is held.
-    """
+    """Hold the reference camera's clock (0 s of [C]) where none is known: rays show differences only."""
     sigma_s = clock_sigma_s.copy()
     if (sigma_s > 0).all():
         names, held = [camera.name for camera in cameras], description.clock_reference

@@ -252,10 +252,7 @@ def on_sides(rays: Float, confidence: Float, sides: Int64) -> tuple[Float, Float
 
 
 def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
-    """Build the pose noise [T, C, 2]: as stated; the median of the others for moving cameras without it.
-
-    A static camera without stated noise was calibrated, and counts as exact.
-    """
+    """Build pose noise [T, C, 2] as stated, else the others' median; a static camera without it is exact."""
     stated = [sigma for sigma in sigmas if sigma is not None]
     usual = np.median(stated, axis=0)
     return np.stack(
@@ -325,10 +322,7 @@ def _velocity(camera: Camera, rays: Float, delay_s: Float) -> Float:
 
 
 def _chosen(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float, Float]:
-    """Gather rays, confidence and delay (s) of each person's keypoints in the camera's frames, as taken.
-
-    Delays of a global shutter are not gathered.
-    """
+    """Gather rays, confidence and delay (s, of rolling shutters) of each person's keypoints, as taken."""
     shape = (len(camera.frame_t_ns), choice.shape[1], len(camera.detections.joints))
     rays = np.full((*shape, 2), np.nan)
     confidence, delay_s = np.full(shape, np.nan), np.full(shape, np.nan)

@@ -651,10 +651,7 @@ class _Bundle:
 
 
 def _adjusted(start: _Similarity, bundle: _Bundle) -> _AdjustedMap:
-    """Adjust poses and points (Levenberg-Marquardt); points are eliminated.
-
-    Cauchy's loss narrows, and the level of sightings is that of their residuals.
-    """
+    """Adjust poses and points (Levenberg-Marquardt, points eliminated), with Cauchy's loss that narrows."""
     found = bundle.found
     count = len(found.key)
     at = start.places(found.position)

@@ -432,10 +432,7 @@ def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
 
 
 def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
-    """Build the sighting of camera `c`, its clock shifted, in its own pictures, all people side by side.
-
-    Left and right are corrected as at the skeleton's nearest time.
-    """
+    """Build the sighting of camera `c`, its clock shifted, in its pictures, all people side by side."""
     t_ns, frame_t_ns = flight.observations.t_ns, camera.frame_t_ns
     nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, frame_t_ns)
     seen = sightings_of(camera, flight.found, c, flight.choice[:, c])

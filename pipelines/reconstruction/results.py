@@ -597,10 +597,7 @@ def _gait_rows(t_ns: Int64, person: int, events: GaitEvents | None) -> pd.DataFr
 
 
 def camera_poses_table(cameras: Sequence[Camera], between: Interpolation) -> pd.DataFrame:
-    """Build the rows of `tables.CAMERA_POSES`: the poses of cameras at their pictures.
-
-    Pictures without a pose, for example in a pause of the log, have no row.
-    """
+    """Build the rows of `tables.CAMERA_POSES`: known poses of cameras at their pictures."""
     return poses_table(cameras, [camera.poses_at(camera.frame_t_ns, between) for camera in cameras])
 
 

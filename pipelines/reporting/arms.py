@@ -103,10 +103,7 @@ class RaisedSurface:
 
 
 def map_around(occupancy: Occupancy, low: Float, high: Float) -> MapAround | None:
-    """Cut the columns of a map within a box [2], [2] m seen from above; None where nothing is occupied.
-
-    0.5 and above is occupied, unknown voxels are not.
-    """
+    """Cut the columns of a map within a box [2], [2] m; None where nothing is occupied (0.5 and above)."""
     shape = np.array(occupancy.probability.shape[:2])
     first, last = (
         np.clip(cells, 0, shape).astype(int)
@@ -146,10 +143,7 @@ def heights(around: MapAround) -> Heights:
 
 
 def surface(around: MapAround, most: int = MAX_SURFACE_POINTS) -> RaisedSurface:
-    """Return the occupied voxels with a free neighbour that rise above the ground.
-
-    They are grouped in cubes of whole voxels, the smallest with which at most `most` cubes are occupied.
-    """
+    """Return voxels with a free neighbour above the ground, in the smallest cubes that leave `most`."""
     occupied = np.pad(around.occupied, 1)
     inner = occupied[1:-1, 1:-1, 1:-1].copy()
     for axis in range(3):
@@ -203,10 +197,7 @@ class Replan:
 
 
 def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Replan:
-    """Collect everything that the page says and draws of a comparison.
-
-    Times count from `origin_ns`; the arms' colours follow those of the session's cameras, of this number.
-    """
+    """Collect what the page says of a comparison; times from `origin_ns`, colours after the cameras'."""
     metrics, filmed = content.metrics, content.filmed
     arms = tuple(
         _arm(name, own, content, origin_ns=origin_ns, colour=cameras + k)

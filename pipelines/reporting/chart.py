@@ -255,10 +255,7 @@ class Figure:
 
     @cached_property
     def csv(self) -> str:
-        """Numbers of all marks, with nine significant digits; empty cells are missing numbers.
-
-        No spreadsheet takes a text of it for a formula.
-        """
+        """Numbers of all marks, nine digits, empty where missing; no text is a formula."""
         return as_csv([row for panels in self.panels for panel in panels for row in _rows_of(panel)])
 
     @cached_property

@@ -184,10 +184,7 @@ def full_covariance(upper: Float) -> Float:
 
 
 def middles(position: Float) -> Float:
-    """Return the middles [T, P, 3] of people with joints [T, P, J, 3]; NaN where no joint is known.
-
-    It is the coordinate-wise median: one wrong joint does not bend a path.
-    """
+    """Return the coordinate-wise medians [T, P, 3] of joints [T, P, J, 3]; NaN where none is known."""
     there = np.isfinite(position[..., 0]).any(axis=-1)
     middle = np.full((*position.shape[:2], 3), np.nan)
     middle[there] = np.nanmedian(position[there], axis=1)

@@ -202,10 +202,7 @@ def choose_moments(motion: MeasuredMotion, error_mm: Float | None = None) -> tup
 
 
 def match_people(reprojected: Float, found: Float) -> list[int | None]:
-    """Match people [P, J, 2] px to detections [D, J, 2] px: the nearest one, each taken once.
-
-    Return for each person the index of a detection; None where none lies within half the body's size.
-    """
+    """Match people [P, J, 2] px to the nearest detections [D, J, 2], each once; None beyond half a body."""
     matches: list[int | None] = []
     for body in reprojected:
         distance = known_median(np.linalg.norm(found - body, axis=-1), 1)
@@ -286,10 +283,7 @@ def status_at(motion: MeasuredMotion, t_ns: Int64) -> NDArray[np.int8]:
 
 
 def angles_at(motion: MeasuredMotion, angles: pd.DataFrame, name: str, t_ns: Int64) -> Float:
-    """Interpolate a joint angle and its standard deviation to [N] times, as the skeleton is; [N, P, 2] deg.
-
-    NaN where a neighbour in time is not determined. Values lie within 180 deg of 0.
-    """
+    """Interpolate an angle and its deviation to times [N]: [N, P, 2] deg, NaN beside what is undetermined."""
     own = angles[angles["angle"] == name]
     times, persons = (np.unique(angles[column]) for column in ("t_ns", "person"))
     values = np.full((len(times), len(persons), 2), np.nan)
@@ -395,10 +389,7 @@ def refined_poses(folder: Path, record: StageRecord) -> dict[str, Trajectory]:
 def read_filmed(
     folder: Path, description: Description, record: StageRecord, frames: Mapping[str, pd.DataFrame]
 ) -> dict[str, FilmedCamera]:
-    """Read cameras with logged or refined poses, and frames (the tables) by the estimated clocks.
-
-    Keypoints below the least confidence of the reconstruction's record are left out.
-    """
+    """Read cameras with logged or refined poses, frames by estimated clocks, and confident keypoints."""
     offset_ns = estimated_clocks(read_json(folder / "reconstruct" / "metrics.json"))
     refined = refined_poses(folder, record)
     filmed = {}

@@ -342,10 +342,7 @@ def _within(points: Float, size: tuple[int, int]) -> Float:
 
 
 def cut_out(picture: Picture, size: tuple[int, int], window: Window, px: int, ground: int = 0) -> Picture:
-    """Cut out a square of `px` pixels; beyond the picture it has the grey of `ground`.
-
-    If the picture's size differs from the calibration's `size`, it is the same view at another scale.
-    """
+    """Cut out a square of `px` pixels, scaled from `size`; beyond the picture it has the grey of `ground`."""
     import cv2
 
     square = np.full((px, px, 3), ground, np.uint8)

@@ -148,10 +148,7 @@ class StudyTable:
 
 
 def tables(metrics: Mapping[str, Any]) -> list[StudyTable]:
-    """Make the tables for readers, as text; `-` where nothing could be measured.
-
-    A study of a walk has a table for each figure, with the axis in columns. That of a session is one table.
-    """
+    """Make the tables of a study, `-` where nothing was measured; of a walk one for each figure."""
     if metrics["kind"] == "session":
         return [_table_of_session(metrics)]
     axis = metrics["axis"]

@@ -224,10 +224,7 @@ def finite_median(values: Float) -> float | None:
 
 
 def camera_errors(summary: Summary) -> dict[str, tuple[float | None, ...]]:
-    """Return the distances in px between each camera's keypoints and the joints; empty without metrics.
-
-    They are the median, the mean, and the median from joints that were reconstructed without the camera.
-    """
+    """Return median, mean, and median without the camera, of keypoints' distances (px) by camera."""
     own = section(summary.metrics, "reprojection_px_per_camera")
     left_out = section(summary.metrics, "leave_one_camera_out_px")
     return {

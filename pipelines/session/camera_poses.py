@@ -21,10 +21,7 @@ from pipelines.session.registries import Registry
 def poses_at(
     track: Trajectory, t_ns: Int64, between: Interpolation, *, static: bool = False
 ) -> tuple[Float, Float]:
-    """Interpolate world_from_camera at [T] times; the first pose of a static camera holds all the time.
-
-    Positions [T, 3] m and quaternions [T, 4] xyzw are NaN where there is no pose.
-    """
+    """Interpolate world_from_camera at times [T], NaN without one; a static camera's always holds."""
     if static:
         still = np.zeros(len(t_ns), dtype=np.intp)
         return track.position[still], track.quaternion_xyzw[still]
@@ -70,10 +67,7 @@ def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[
 
 
 def parsed_noise_models(place: str, text: str) -> list[NoiseModel]:
-    """Build the pose noise models of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
-
-    DataError about `place` if the text has another form, or names an unknown model or parameter.
-    """
+    """Build the noise models of a text (`geometry.noise.parse`); DataError about `place`."""
     try:
         parts = parse(text)
     except ValueError as error:
@@ -92,10 +86,7 @@ def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> lis
 def stated_noise(
     name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
 ) -> StatedNoise:
-    """Compute the uncertainty of each logged pose, from models or else from its covariances.
-
-    DataError if a model is not known.
-    """
+    """Compute the uncertainty of each pose by models, else its covariances; DataError: an unknown one."""
     models = stated_models(name, entry, pose_noise)
     if models is None:
         covariance = logged_covariance(trajectory)

@@ -358,10 +358,7 @@ class Description(Entry):
 
     @property
     def recorded(self) -> dict[str, str]:
-        """The hashes of recordings that were ingested: every camera's pictures, and the actor's log.
-
-        They are named as inputs of stages are. Clocks, poses and calibrations do not change them.
-        """
+        """The hashes of recordings, as inputs of stages; clocks and calibrations do not change them."""
         recorded = {
             f"pictures of {name}": hash_of(
                 [

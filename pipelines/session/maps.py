@@ -61,10 +61,7 @@ class MapSizeError(DataError):
 
 
 def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, remedy: str = "") -> None:
-    """Refuse a grid that would not fit, before anything is allocated for it, with a MapSizeError.
-
-    `remedy` says what makes it smaller, beside a larger resolution.
-    """
+    """Refuse a grid that would not fit, with a MapSizeError and its `remedy`, before it is allocated."""
     voxels = math.prod(float(side) for side in shape)
     if voxels <= MOST_VOXELS:
         return
@@ -152,10 +149,7 @@ def write_grid(path: Path, occupancy: Occupancy) -> None:
 
 
 def read_grid(path: Path) -> Occupancy:
-    """Read one map in the layout of the module's docstring, whichever program wrote it.
-
-    DataError if it is damaged, of another layout, holds impossible numbers, or more than `MOST_VOXELS`.
-    """
+    """Read a map in the layout of the module; DataError: damaged, another layout, too many voxels."""
     refuse_special(path)
     try:
         with zipfile.ZipFile(path) as archive:

@@ -122,10 +122,7 @@ class PackagedModels:
         return {name: path if path.is_file() else None for name, path in paths.items()}
 
     def verified(self) -> dict[str, Path]:
-        """Return each file's path by name, after checking its SHA-256.
-
-        DataError: one is missing or has other content.
-        """
+        """Return each file's path by name; DataError: one is missing or has another SHA-256."""
         for file in self.files:
             path = self.folder / file.name
             if not path.is_file():

@@ -204,10 +204,7 @@ def return_freed_arrays() -> None:
 
 
 def return_unused() -> None:
-    """Give memory back that allocators hold after its use, so that every part of a flight finds as much.
-
-    Without it the most memory of a process grew by 60 MB in sixteen segments of an hour.
-    """
+    """Return memory to the system after use: else a process grew by 60 MB in sixteen parts of an hour."""
     import pyarrow as pa
 
     gc.collect()

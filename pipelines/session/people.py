@@ -166,10 +166,7 @@ def skeleton_with(count: int) -> tuple[Skeleton, ...]:
 
 
 def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...], axis: int = -2) -> Float:
-    """Select the entries of the `wanted` joints along an axis of [..., J, ...], in their order.
-
-    A joint that is absent from `joints` is NaN.
-    """
+    """Select the `wanted` joints along an axis of [..., J, ...], in their order; NaN for absent ones."""
     column = {joint: index for index, joint in enumerate(joints)}
     source = np.array([column.get(joint, -1) for joint in wanted], dtype=np.int64)
     by_joint = np.moveaxis(values, axis, 0)
@@ -179,10 +176,7 @@ def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...],
 
 
 def with_derived(joints: tuple[str, ...], position: Float) -> tuple[tuple[str, ...], Float]:
-    """Append the joints of `DERIVED` that are absent and whose parents are there, and their positions.
-
-    `position` is [..., J, D]. A derived joint is NaN where a parent is.
-    """
+    """Append the joints of `DERIVED` whose parents are there to positions [..., J, D]; NaN as a parent."""
     for joint, parents in DERIVED:
         if joint in joints or not set(parents).issubset(joints):
             continue
@@ -234,10 +228,7 @@ GAP_IN_USUAL_STEPS = 1.5
 
 
 def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
-    """Interpolate true positions [T, P, J, 3] at given times, linearly.
-
-    NaN outside the truth, next to a sample without the joint, and across a gap longer than `longest_step_ns`.
-    """
+    """Interpolate the truth [T, P, J, 3] linearly; NaN outside, beside missing joints and in long gaps."""
     return interpolate_points(truth.t_ns, truth.position, t_ns, max_gap_ns=longest_step_ns(truth.t_ns))
 
 

@@ -56,10 +56,7 @@ class Halt:
 
 
 def side_by_side(work: Callable[[T], R], parts: Iterable[T], *, workers: int, halt: Halt) -> list[R]:
-    """Call `work` on every part in threads and return the results in the order of the parts.
-
-    `work` checks `halt` from time to time; it is set when one part fails or the user interrupts.
-    """
+    """Call `work` on parts in threads, results in order; `halt`, which it checks, is set if one fails."""
     if workers == 1:
         return [work(part) for part in parts]
     with ThreadPoolExecutor(workers) as pool:

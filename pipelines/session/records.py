@@ -24,10 +24,7 @@ POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Logged poses of one moving object.
-
-    Stamps strictly increase and every number is finite. Readers count bad rows by cause in `dropped`.
-    """
+    """Logged poses of an object: rising stamps, finite numbers, bad rows counted by cause in `dropped`."""
 
     t_ns: Int64  # [N]
     position: Float  # [N, 3] m
@@ -76,10 +73,7 @@ class Detections:
 
 @dataclass(frozen=True)
 class JointMotion:
-    """3D joints of one or more people over time: truth, or a skeleton to export.
-
-    `t_ns` strictly increases. NaN marks a joint that is missing at that time.
-    """
+    """3D joints of people at rising times: truth, or a skeleton; NaN marks a joint that is missing then."""
 
     t_ns: Int64  # [T]
     joints: tuple[str, ...]
@@ -333,10 +327,7 @@ Height = Literal["sea level", "ellipsoid", "take-off", "stated", "unknown"]
 
 @dataclass(frozen=True)
 class PositionTrack:
-    """A drone's positions over time: on Earth, or in metres from the origin of its estimator.
-
-    Stamps strictly increase and every number is finite, as in `Trajectory`.
-    """
+    """A drone's positions, on Earth or in m from its estimator's origin; as in `Trajectory`."""
 
     name: str  # as the log calls it, for messages
     t_ns: Int64  # [N]

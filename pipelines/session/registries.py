@@ -342,10 +342,7 @@ DETECTORS: Registry[Detector | DetectorFamily] = Registry("mocap.detectors", "de
 
 
 def find_detector(text: str) -> Detector:
-    """Find the detector of a user's text: a registered name, or a family's name, a colon and its argument.
-
-    DataError: no such name, an argument where none is taken, none where one is needed, or a bad one.
-    """
+    """Find a detector: a name, or a family's name, a colon and its argument; DataError: one is wrong."""
     name, colon, argument = text.partition(":")
     found = DETECTORS.get(name)
     if not isinstance(found, DetectorFamily):
@@ -358,10 +355,7 @@ def find_detector(text: str) -> Detector:
 
 
 def find_export(text: str) -> Export:
-    """Find the export of a user's text: a registered name, for some with a colon and an argument.
-
-    DataError: no such name, an argument where none is taken, or a bad one.
-    """
+    """Find an export: a name, for some a colon and an argument; DataError: one is wrong."""
     name, colon, argument = text.partition(":")
     found = EXPORTS.get(name.lower())
     if colon and isinstance(found, ExportFamily):
@@ -395,10 +389,7 @@ def need(module: str, extra: str) -> Any:
 
 
 def install_command(extra: str) -> str:
-    """Write the command that installs the libraries of an extra, by their own names.
-
-    This package is on no package index, so pip would not find `mocap-pipeline[extra]`.
-    """
+    """Write the command that installs an extra's libraries: pip does not know `mocap-pipeline[extra]`."""
     listed = [_OF_EXTRA.fullmatch(line) for line in requires("mocap-pipeline") or ()]
     names = [found["requirement"] for found in listed if found and found["extra"] == extra]
     if not names:

@@ -96,10 +96,7 @@ def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, st
 
 
 def outdated(records: Mapping[str, StageRecord], recorded: Mapping[str, str]) -> list[str]:
-    """List the stages of which something that they were made of has changed since.
-
-    `recorded` are the hashes of the recordings (`Description.recorded`).
-    """
+    """List the stages of which something that they were made of, or a recording's hash, has changed."""
     made = {**recorded, **{stage: record.key for stage, record in records.items()}}
     for record in records.values():
         made |= record.outputs
@@ -414,10 +411,7 @@ def session_name(folder: Path) -> str:
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """Return the name of each flight or session, that of its file or of the folder around a `flight.yaml`.
-
-    DataError if two have the same name.
-    """
+    """Return the names of flights: the file's, or the folder's of a `flight.yaml`; DataError: two alike."""
     named: dict[str, Path] = {}
     for path in paths:
         whole = path.resolve()

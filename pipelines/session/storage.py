@@ -108,10 +108,7 @@ def text_encoding(content: bytes) -> str:
 
 
 def plain_text(content: bytes, errors: str = "replace") -> str:
-    r"""Decode UTF-8, or UTF-16 that begins with its mark, without the mark and with lines ending in "\n".
-
-    UnicodeDecodeError for bytes that are no such text, with `strict`; else they become signs of no number.
-    """
+    r"""Decode UTF-8, or UTF-16 with its mark, lines ending in LF; UnicodeDecodeError with `strict`."""
     return content.decode(text_encoding(content), errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -152,10 +149,7 @@ def sha256_of(path: Path) -> str:
 
 
 def file_stamp(path: Path) -> str:
-    """Hash a file's size and time of change, or those of all files of a folder with their names.
-
-    If the stamp is unchanged, nothing was written, and the content need not be read again.
-    """
+    """Hash sizes and times of change of a file, or a folder's files: unchanged if nothing was written."""
     try:
         if not path.is_dir():
             return hash_of(_size_and_change(path))
@@ -216,10 +210,7 @@ def hash_of(value: object) -> str:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON object with its keys in their order; a kill leaves the old file or the new one, complete.
-
-    ValueError if it holds NaN or an infinite number (`jsonable` turns NaN into null).
-    """
+    """Write a JSON object so that a kill leaves the old file or the new one; ValueError: NaN or infinite."""
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     write_whole(path, text.encode("utf-8"))
 

@@ -187,10 +187,7 @@ def table_parts(path: Path, schema: pa.Schema) -> list[tuple[int, Callable[[], p
 
 
 def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
-    """Read a table with the columns of `schema` (more are kept).
-
-    DataError: missing, not a Parquet file, truncated, or columns are missing.
-    """
+    """Read a table with the columns of `schema` (more are kept); DataError: missing, or damaged."""
     with _opened(path) as opened:
         return _frame_of(path, opened.read(), schema)
 

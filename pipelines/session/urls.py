@@ -119,10 +119,7 @@ def as_urls(text: str) -> str:
 
 
 def media_path(base: Path, stated: str, session: Path) -> str:
-    """Write where a source (or `base` itself) lies: its URL, or its path from the session's folder.
-
-    A session at a URL holds the whole path instead.
-    """
+    """Write where a source lies: its URL, or its path from the session's folder (whole for a URL's)."""
     url = source_url(base, stated or ".")
     if url is not None:
         return url

@@ -50,10 +50,7 @@ MAX_MERGED_ENTRIES = 100_000
 
 
 def plain_yaml(path: Path, text: str) -> object:
-    """Parse YAML into plain types only.
-
-    DataError if it is no YAML, beyond reason as merges of merges, or holds what no program can use.
-    """
+    """Parse YAML into plain types only; DataError: it is none, beyond reason, or holds impossible values."""
     from ruamel.yaml import YAML
     from ruamel.yaml.constructor import ConstructorError, SafeConstructor
     from ruamel.yaml.error import MarkedYAMLError, YAMLError

@@ -64,10 +64,7 @@ def normals(vertices: Float, faces: Index) -> Float:
 
 
 def cut(patch: Patch, keep: Float) -> Patch:
-    """Return the part of a patch where `keep` [V], linear in each triangle, is not negative.
-
-    Along the cut, vertices are added whose values are linear between the ends of the edge that was cut.
-    """
+    """Return the part of a patch where `keep` [V], linear in triangles, is not negative; edges split."""
     inside = keep[patch.faces] >= 0
     count = inside.sum(axis=1)
     one = _odd_first(patch.faces[count == 1], inside[count == 1])

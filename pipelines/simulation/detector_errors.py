@@ -68,10 +68,7 @@ class ErrorTable:
     rows: Mapping[str, Float]  # [K, 4]: tilt in degrees, rising; median error share; missed share; confidence
 
     def at(self, tilt_deg: Float, joints: tuple[str, ...]) -> tuple[Float, Float, Float]:
-        """Return median error share, missed share and confidence, each [T, J].
-
-        Linear between the measured tilts; beyond them as at the nearest.
-        """
+        """Return median error share, missed share, confidence [T, J]; linear between measured tilts."""
         tables = [self.rows.get(name, self.rows[ANY_JOINT]) for name in joints]
         values = np.empty((3, len(tilt_deg), len(joints)))
         for j, table in enumerate(tables):

@@ -120,10 +120,7 @@ class Set:
 
 
 def build_set(scenario: Scenario, *, bvh: Mapping[str, SkeletalMotion] | None = None) -> Set:
-    """Build a scenario's world and let its actors move there; `bvh` has recorded motions by actor.
-
-    DataError: the world cannot be built, or a motion is not that of a person.
-    """
+    """Build a scenario's world, and move its actors; DataError: impossible, or no person's motion."""
     people = []
     for index, (name, look) in enumerate(scenario.people.items()):
         person = make_body(look.body)

@@ -434,10 +434,7 @@ def sample_log(
 
 
 def gimbal_attitude(camera_xyzw: Float) -> Float:
-    """Convert world_from_camera [..., 4] to world_from_gimbal [..., 4].
-
-    The gimbal's x points where the camera looks, z up in the picture.
-    """
+    """Convert world_from_camera [..., 4] to world_from_gimbal: x is the view, z up in the picture."""
     return multiply(camera_xyzw, conjugate(body_from_camera("forward")))
 
 

@@ -488,10 +488,7 @@ _GO_DOWN_S, _REACH_S = 0.9, 0.7
 
 
 def crouch(plan: Plan, seconds: float, depth: float) -> None:
-    """Go down, stay, come up again.
-
-    The thighs are level at two thirds of the depth. Deeper, the heels are off the ground.
-    """
+    """Go down, stay, come up; thighs are level at two thirds of the depth, heels off beyond."""
     down = plan.t_s + _GO_DOWN_S * (0.6 + 0.4 * depth)
     up = down + seconds
     end = up + down - plan.t_s

@@ -333,10 +333,7 @@ _BRIGHTEST = 4.0
 
 
 def developed(light: Float32, key: int) -> Bytes:
-    """Convert a field of linear RGB light [H, W, 3] to the BGR bytes of a picture.
-
-    The same key (64 bits) gives the same noise.
-    """
+    """Convert linear RGB light [H, W, 3] to BGR bytes; the same key (64 bits) gives the same noise."""
     return _developed(light, np.uint64(key), _CURVE)
 
 

@@ -299,10 +299,7 @@ class StudiedNoise:
     model: str  # as users write it; empty for exact poses
 
     def models(self) -> list[NoiseModel]:
-        """Parse the noise models.
-
-        DataError: the text is not a noise model, or a name is unknown.
-        """
+        """Parse the noise models; DataError: the text is not a noise model, or a name is unknown."""
         return parsed_noise_models("noise", self.model) if self.model else []
 
 
@@ -396,10 +393,7 @@ def numbers(
     most: float,
     default: Sequence[str] = (),
 ) -> list[Any]:
-    """Read the numbers of a variable.
-
-    DataError: one is no number, out of range (NaN, too), or given twice.
-    """
+    """Read the numbers of a variable; DataError: one is no number, out of range (NaN, too), or twice."""
     texts = values.get(name) or default
     try:
         found = [number(text) for text in texts]

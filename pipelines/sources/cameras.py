@@ -186,10 +186,7 @@ class FlightCameras:
     def intrinsics(
         self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> Intrinsics:
-        """Return the intrinsics of a camera, fitted to the size of its pictures.
-
-        DataError: missing, for pictures of another shape, or too small for the keypoints.
-        """
+        """Return a camera's intrinsics, fitted to its pictures; DataError: missing, or another shape."""
         source = camera.intrinsics
         place = f"{self._manifest}: cameras.{name}.intrinsics"
         if source.file and not self._files.is_log("intrinsics", source):

@@ -159,10 +159,7 @@ class FlightFiles:
         return cameras[camera or name]
 
     def true_joints(self, source: TruthSource) -> JointMotion:
-        """Read the true joints; drop and count positions too far from the others to be true.
-
-        DataError: the file cannot be used, its axes are unknown, or no position is left.
-        """
+        """Read the true joints, without positions far from others; DataError: none left, or unknown axes."""
         path = self.path(source.file)
         reader = recognise(path, JointFormat, "file of true joints", name=source.format)
         own_axes = source.axes is not None or source.up is not None
@@ -303,10 +300,7 @@ def hash_sources(flight: Manifest, base: Path, progress: Progress) -> dict[str, 
 
 
 def fetch_sources(flight: Manifest, base: Path, progress: Progress) -> None:
-    """Fetch the files that a manifest states by URL, where the copies in the cache are not as in the store.
-
-    DataError: a store cannot be read, or holds no such file.
-    """
+    """Fetch the files stated by URL that changed in the store; DataError: it cannot be read, or lacks one."""
     urls = [url for path in flight.files if (url := source_url(base, path))]
     if urls:
         progress.start("Fetching sources", len(urls))
@@ -316,10 +310,7 @@ def fetch_sources(flight: Manifest, base: Path, progress: Progress) -> None:
 
 
 def source_stamps(flight: Manifest, base: Path) -> dict[str, str]:
-    """Return the stamp of every file that is read, by the manifest's path.
-
-    DataError: one of them is missing or cannot be read.
-    """
+    """Return the stamp of every file by the manifest's path; DataError: one is missing or unreadable."""
     stamps = {
         path: [file_stamp(file) for file in _source_files(located(base, path))] for path in flight.files
     }
@@ -327,10 +318,7 @@ def source_stamps(flight: Manifest, base: Path) -> dict[str, str]:
 
 
 def refuse_written(flight: Manifest, base: Path, stamps: Mapping[str, str]) -> None:
-    """Refuse sources that changed since they had these stamps, so that the hash fits what was read.
-
-    DataError: a source changed, or is missing.
-    """
+    """Refuse sources that changed since these stamps, with a DataError: the hash fits what was read."""
     for path, stamp in source_stamps(flight, base).items():
         if stamp != stamps[path]:
             problem = "was written to while it was being read"

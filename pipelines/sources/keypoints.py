@@ -97,10 +97,7 @@ def doubt_numbers(detections: Detections, frames: CameraFrames, *, from_video: b
 
 
 def unmirrored(detections: Detections, mirrored: bool | str, intrinsics: Intrinsics) -> Detections:
-    """Undo that keypoints were found in mirrored pictures.
-
-    `mirrored`: True, or "x" alone counts from the right, "y" from below, "names" alone have left for right.
-    """
+    """Undo mirrored pictures: True; "x" alone counts from the right, "y" from below; "names" swap."""
     if mirrored in (True, "x"):
         xy = detections.xy.copy()
         xy[..., 0] = intrinsics.width - 1 - xy[..., 0]

@@ -89,10 +89,7 @@ class FlightLog:
         return next((known.type for known in self.recording.topics if known.name == topic), None)
 
     def choose(self, kind: Kind, topic: str | None) -> str:
-        """Return the topic that is named, or the only one of its kind.
-
-        DataError: no such topic, one of another kind, or several candidates.
-        """
+        """Return the topic that is named, or the only one of its kind; DataError: none, or several."""
         there = [known.name for known in self.recording.topics if kind_of(known) == kind]
         return self.choose_among(there, _NOUNS[kind], topic)
 

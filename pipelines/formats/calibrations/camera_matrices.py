@@ -29,10 +29,7 @@ def intrinsics(
     distortion: Sequence[float],
     fisheye: bool,
 ) -> Intrinsics:
-    """Build intrinsics from a size [2], a matrix [3, 3] without skew and OpenCV's coefficients, all in px.
-
-    Coefficients that are all zero, or none, are no distortion (unless fisheye: then equidistant).
-    """
+    """Build intrinsics, px, of OpenCV's coefficients; zeros are no distortion (of a fisheye: equidistant)."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or len(size) != 2:
         raise DataError(source, f"camera {camera} has no 3 x 3 matrix of numbers and size of two")
     skew, last = abs(matrix[0, 1]), matrix[2]

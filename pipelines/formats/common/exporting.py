@@ -24,10 +24,7 @@ def safe_file_name(name: str) -> str:
 
 
 def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMotion, dict[int, Path]]:
-    """Return a recording's motion, and a file for each person with at least one known joint.
-
-    The file is `<name>.trc`, or `<name>_<person>.trc` if there are several people (for the suffix `.trc`).
-    """
+    """Return the motion, and `<name>.trc` or, of several people with joints, `<name>_<person>.trc`."""
     motion = recording.motion
     if motion is None or np.isnan(motion.position).all():
         raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
@@ -104,10 +101,7 @@ def shown_surface(recording: Recording, occupancy: Occupancy, export: str) -> Ma
 
 
 def surface_of(occupancy: Occupancy) -> MapSurface:
-    """Find the surface of a map, in cubes of as few whole voxels as give at most `MOST_CUBES`.
-
-    Voxels beyond the map's box and unknown voxels count as not occupied.
-    """
+    """Find the surface of a map in at most `MOST_CUBES` cubes of whole voxels; unknown is not occupied."""
     from scipy.ndimage import binary_erosion
 
     occupied = occupancy.probability >= 0.5  # False where nothing is known

@@ -37,10 +37,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def first_bytes(path: Path, count: int = HEAD_BYTES, *, suffixes: Collection[str] = ()) -> bytes:
-    """Read the beginning of a file, to recognise it; empty for what cannot be read. Never raises.
-
-    If `suffixes` (in lower case) are stated, it is also empty for a file with another one.
-    """
+    """Read the beginning of a file; empty without one of the suffixes, and never an error."""
     if (suffixes and path.suffix.lower() not in suffixes) or is_special(path):
         return b""
     try:
@@ -51,10 +48,7 @@ def first_bytes(path: Path, count: int = HEAD_BYTES, *, suffixes: Collection[str
 
 
 def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]], Bytes]:
-    """Split a file's content into the words of each header line and the bytes below the header.
-
-    `last` is the first word of the header's last line.
-    """
+    """Split a file into words of header lines, to the one that begins with `last`, and the bytes below."""
     lines: list[list[str]] = []
     start = 0
     while start < min(len(content), HEAD_BYTES):
@@ -70,10 +64,7 @@ def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]]
 
 
 def read_yaml(path: Path) -> dict[str, object]:
-    """Read the mapping at the top of a YAML file, built of plain types only.
-
-    The first line `%YAML:1.0` of old OpenCV and Kalibr files, which is no YAML, is skipped.
-    """
+    """Read the mapping of a YAML file, of plain types only; the line `%YAML:1.0` of OpenCV is skipped."""
     text = read_text(path)
     if len(text) > _LARGEST_YAML:
         raise DataError(path, f"has {len(text)} characters", f"a calibration has less than {_LARGEST_YAML}")

@@ -147,10 +147,7 @@ class ArduPilotFormat(DroneLog):
         return head.startswith(_START) and head[5:9].rstrip(b"\0") == b"FMT"
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Read position, attitude and mount.
-
-        The position is POS (`global`), else XKF1 or NKF1 (`local`, metres from ORGN), else GPS.
-        """
+        """Read mount, attitude and position: POS (`global`), else XKF1 or NKF1 (`local`), else GPS."""
         log = _DataFlash(path)
         dropped: dict[str, int] = {}
         notes = [] if log.boots is None else log.boots.notes()

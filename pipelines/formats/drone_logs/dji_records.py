@@ -85,10 +85,7 @@ class DjiRecordFormat(DroneLog):
         return _find_heading(read_head(path, self.suffixes)) is not None
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Read positions, and the angles of body and gimbal if the record has them.
-
-        A position that is repeated until the next measurement is replaced by linear interpolation.
-        """
+        """Read positions, interpolated where they are repeated, and angles of body and gimbal."""
         record = _read(path)
         return telemetry_of_rows(path, record.rows, choice, record.notes)
 

@@ -161,10 +161,7 @@ def angles_track(
     *,
     rows: str = "subtitles",
 ) -> AttitudeTrack | None:
-    """Build the attitude from angles [N, 3]; None if there are none. `rows` names the rows for losses.
-
-    An angle that is repeated until the next measurement is replaced by linear interpolation.
-    """
+    """Build the attitude from angles [N, 3], interpolated where they are repeated; None without any."""
     stated = np.isfinite(yaw_pitch_roll_deg).all(axis=1)
     if not stated.any():
         return None
@@ -227,10 +224,7 @@ class Subtitles:
         return int(self.clock_ns[shown[0]] - self.media_ns[shown[0]]) if len(shown) else None
 
     def focal_35_mm(self) -> float | None:
-        """Return the focal length of the last subtitle, as on film 36 mm wide; None without.
-
-        `[focal_len: 24.00]` is in mm, `[focal_len : 280]` in tenths.
-        """
+        """The last focal length on 36 mm film: `[focal_len: 24.00]` mm, `[focal_len : 280]` in tenths."""
         found = re.search(r"\[focal_len *: *(\d+(?:\.\d+)?)", self.texts[-1])
         stated = float(found[1]) if found else 0.0
         return (stated / 10 if stated > MAX_FOCAL_35_MM else stated) or None
@@ -259,10 +253,7 @@ def read_subtitles(path: Path) -> Subtitles:
 
 
 def parse_subtitles(text: str) -> Subtitles:
-    """Parse the subtitles of a text; the result is empty if it has none.
-
-    Subtitles without display times are taken to be shown from their clock times on, the first at 0.
-    """
+    """Parse subtitles; those without display times are shown from their clock times on, the first at 0."""
     blocks = list(_BLOCK.finditer(text))
     timed = bool(blocks)
     blocks = blocks or list(_UNTIMED.finditer(text))
@@ -333,10 +324,7 @@ class DjiSrtFormat(DroneLog):
         )
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Read positions, and the angles of body and gimbal if the subtitles have them.
-
-        A position that is repeated until the next measurement is replaced by linear interpolation.
-        """
+        """Read positions, interpolated where they are repeated, and angles of body and gimbal."""
         subtitles = read_subtitles(path)
         return telemetry_of_rows(path, _rows(subtitles), choice, [_note_on_clock(subtitles)])
 

@@ -286,10 +286,7 @@ def find_boots(
 
 
 def fit_gps_time(boot_ns: Int64, utc_ns: Int64) -> ClockFit | None:
-    """Fit UTC by a receiver to the time since boot, without steps of whole seconds.
-
-    A receiver learns of leap seconds in flight. So its last times count, and earlier ones are moved.
-    """
+    """Fit UTC to the time since boot by its last values: a receiver learns of leap seconds in flight."""
     lead_ns = utc_ns - boot_ns
     leaps_s = np.rint(np.diff(lead_ns) / 1e9).astype(np.int64)
     mended, steps_s = utc_ns.copy(), []
@@ -325,10 +322,7 @@ def on_gps_time(
 
 
 def refuse_marks(path: Path, *marks: bytes, most: int | None = None) -> None:
-    """Refuse a log with more beginnings of messages than messages fit into it: a parser tries each of them.
-
-    `most` is by default 100,000, or one for eight bytes if that is more.
-    """
+    """Refuse a log with more beginnings of messages than fit into it (100,000, or one for eight bytes)."""
     size = path.stat().st_size
     if size < _FEW_MARKS:
         return

@@ -236,10 +236,7 @@ class Gathering:
             raise DataError(self.path, problem, "check the folder, or export the keypoints again")
 
     def frame_of(self, name: object, where: str, file: Path | None = None) -> int:
-        """Return the frame number of a picture's name or number, and list that frame.
-
-        `file` is stated if each of several files counts frames by itself.
-        """
+        """Return and list the frame number of a picture's name; `file` if each file counts alone."""
         frame = frame_number(name, self.digits)
         if frame is None:
             problem = f"picture {name!r} has no frame number"
@@ -265,10 +262,7 @@ class Gathering:
     def add(
         self, frame: int, rows: Float, where: str, *, rank: int | None = None, own_id: int | None = None
     ) -> None:
-        """Add a person of a frame with its rows [K, 3] of x, y, confidence.
-
-        `rank` is the position within the frame, `own_id` the number that a tracker gave.
-        """
+        """Add a person: rows [K, 3] of x, y, confidence; place in the frame; a tracker's number."""
         if self._rows and len(rows) != len(self._rows[0]):
             problem = f"holds {len(rows)} keypoints where the people before hold {len(self._rows[0])}"
             raise DataError(where, problem, "one file or folder holds one skeleton")
@@ -281,10 +275,7 @@ class Gathering:
     def add_named(
         self, frame: int, names: Sequence[str], points: Float, where: str, **ids: int | None
     ) -> None:
-        """Add a person whose keypoints [K, 3] have names of the user's own; unknown ones are left out.
-
-        The skeleton is the smallest that has the most of them.
-        """
+        """Add a person with names for keypoints [K, 3], in the smallest skeleton with the most."""
         if self.joint_names is None:
             joints = {joint_called(name) for name in names}
             fit = max(SKELETONS.values(), key=lambda s: (len(joints & {*s.joints}), -len(s.joints)))

@@ -32,10 +32,7 @@ _STAMP_LIMIT = 1 << 63
 
 
 class McapPart(ChunkedPart):
-    """MCAP file with messages in ros1, cdr, json or protobuf; checksums of chunks are verified.
-
-    Messages outside chunks are handled as uncompressed chunks.
-    """
+    """MCAP file in ros1, cdr, json or protobuf, checked; messages outside chunks are uncompressed chunks."""
 
     def walk(self) -> tuple[int, bool]:
         """Walk the records up to the end of the file or to the first incomplete one."""

@@ -216,10 +216,7 @@ class _Decompressor(Protocol):
 
 
 def inflate(data: memoryview | bytes, compression: str, size: int) -> tuple[memoryview | bytes, bool]:
-    """Decompress at most `size` bytes of a frame that is perhaps cut off; also return True if that was all.
-
-    `compression` is none (or empty), bz2, lz4 or zstd.
-    """
+    """Decompress at most `size` bytes of a frame (none, bz2, lz4, zstd); True if that was all."""
     if compression in {"", "none"}:
         return data[:size], len(data) <= size
     if compression == "bz2":

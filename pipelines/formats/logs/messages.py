@@ -278,10 +278,7 @@ def _stamp_ns(message: Message) -> int:
 
 
 def header_ns(message: Message) -> int:
-    """Return the stamp that a message of any type has of its own; 0 without one, or if it is no time.
-
-    Of transforms it is that of the first.
-    """
+    """Return the stamp that a message of any type has of its own (the first transform's); 0 without one."""
     value = message.value
     stated = next(iter(getattr(value, "transforms", ())), value)
     stamp = getattr(getattr(stated, "header", None), "stamp", None) or getattr(stated, "timestamp", None)

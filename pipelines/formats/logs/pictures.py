@@ -61,10 +61,7 @@ _Stamped = TypeVar("_Stamped", bound=Stamped)
 
 
 def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
-    """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic's pictures.
-
-    The order is that of receipt.
-    """
+    """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic, in order of receipt."""
     header_ns, receive_ns = array("q"), array("q")
     for sample in all_samples(recording.messages([topic]), source):
         if not isinstance(sample, PictureSample):

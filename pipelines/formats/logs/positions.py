@@ -41,10 +41,7 @@ def axes_of_topic(topic: str | None, parent: str | None) -> Axes | None:
 
 
 def pairs_of(topics: Sequence[Topic]) -> list[tuple[str, str]]:
-    """Find topics of positions on Earth, each with the topic of attitudes that shares most of its name.
-
-    Raw attitudes are left out.
-    """
+    """Find topics of positions on Earth, each with attitudes (not raw ones) that share most of its name."""
     turned = sorted(t.name for t in topics if t.count and t.type in _TURNED and "raw" not in t.name)
     return [
         (t.name, max(turned, key=lambda name: len(commonpath([f"/{name}", f"/{t.name}"]))))

@@ -233,10 +233,7 @@ def chained(
 
 
 def _published_values(logged: Sequence[LoggedRows]) -> LoggedRows:
-    """Join the rows of a static transform in the order of receipt, without repeated values.
-
-    Their times are those of receipt, unless the headers rise with every new value.
-    """
+    """Join the rows of a static transform without repeats, by receipt, or by headers if these always rise."""
     receive_ns = np.concatenate([rows.receive_ns for rows in logged])
     order = np.argsort(receive_ns, kind="stable")
     receive_ns = receive_ns[order]

@@ -69,10 +69,7 @@ class _OctomapHeader:
 
 
 class OctomapFormat(MapFile):
-    """Reader into the tree's own voxels, or into voxels 2, 4, 8, ... times as wide if the user states so.
-
-    A wider voxel has the largest probability of the known leaves within it: an obstacle is never lost.
-    """
+    """Reader into the tree's voxels, or 2, 4, 8, ... times wider ones with the largest probability inside."""
 
     name = "octomap"
     title = "OctoMap"

@@ -103,10 +103,7 @@ def walk_full(children: Bytes, node: Int32, key: Int32, depth: Bytes) -> int:
 
 @cached
 def fill(grid: Float32, key: Int32, depth: Bytes, probability: Float32, low: Int64, halvings: int) -> None:
-    """Set every voxel of `grid` (NaN before) to the largest probability of the leaves within it.
-
-    A voxel is 2 ** halvings finest voxels wide; the first one's key, counted in such voxels, is `low`.
-    """
+    """Set voxels of `grid` (2 ** halvings wide, from key `low`) to the largest probability inside them."""
     for leaf in range(len(depth)):
         side = max(1, (1 << (DEPTH - np.int64(depth[leaf]))) >> halvings)
         x0 = (np.int64(key[leaf, 0]) >> halvings) - low[0]

@@ -55,10 +55,7 @@ class _FloorPlan:
 
 
 class RosMap(MapFile):
-    """Reader into voxels of the plan's own resolution, or of a stated one.
-
-    A voxel takes the largest probability met in it: a wall may grow by a voxel, but never vanishes.
-    """
+    """Reader into voxels with the largest probability met in each: a wall may grow, but never vanishes."""
 
     name = "ros_map"
     title = "ROS floor plan"

@@ -145,10 +145,7 @@ def placed(
 def extruded(
     source: str, plan: Float32, resolution_m: float, world_from_plan: Pose, *, side_m: float, height_m: float
 ) -> Occupancy:
-    """Convert a floor plan [X, Y] of probabilities, with the pose of its origin, to voxels extruded upwards.
-
-    `height_m` is rounded up to whole voxels of `side_m`.
-    """
+    """Extrude a floor plan [X, Y] of probabilities upwards by `height_m`, rounded up to whole voxels."""
     position, quaternion = world_from_plan
     rotation = matrix_from_quaternion(quaternion)
     if abs(rotation[2, 2]) < 0.5:  # on edge: `placed` would turn it squarely

@@ -79,10 +79,7 @@ class _BvhFile:
 
 
 class BvhFormat:
-    """Reader of the joints at which bones begin.
-
-    Known bones get our joints' names (LeftUpLeg and lfemur are left_hip), others keep theirs.
-    """
+    """Reader of the joints at which bones begin, by our names where known (LeftUpLeg is left_hip)."""
 
     name = "bvh"
     title = "Biovision motion (BVH)"
@@ -97,10 +94,7 @@ class BvhFormat:
         return describe_motion(self.read_joints(path, unit="m", axes=None))
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read every frame, the first at 0 s; `axes` is y-up unless stated.
-
-        Without a unit it is that of m, cm, mm, inch and CMU's in which the rest pose is as tall as an adult.
-        """
+        """Read every frame, y up unless stated, in the unit that makes the rest pose an adult."""
         contents = _read(path)
         axes = axes or "y-up"
         metres = {**METRES, "ft": 0.3048}[unit] if unit else _likely_unit(path, contents.bones, axes)
@@ -354,10 +348,7 @@ _MUST = ("left_hip", "right_hip", "neck")
 
 
 class BvhExport:
-    """Writer of `<name>.bvh`, or `<name>_<person>.bvh` for each of several people; default cm and y up.
-
-    The module documents the fit of the rig and the handling of missing joints.
-    """
+    """Writer of `<name>.bvh`, or `<name>_<person>.bvh` for each of several; by default cm and y up."""
 
     name = "bvh"
     title = "a rig of constant bones that follows the skeleton, for Blender"
@@ -443,10 +434,7 @@ def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) ->
 
 
 def euler_zxy_deg(quaternion_xyzw: Float) -> Float:
-    """Compute angles (z, x, y) in degrees of the rotation Rz Rx Ry, [T, B, 3]; continuous over time.
-
-    If x is +-90 degrees, z and y turn about the same axis, and y is set to 0.
-    """
+    """Compute continuous angles (z, x, y), deg, of Rz Rx Ry, [T, B, 3]; y is 0 where x is +-90 degrees."""
     m = matrix_from_quaternion(quaternion_xyzw)
     x = np.arctan2(m[..., 2, 1], np.hypot(m[..., 2, 0], m[..., 2, 2]))
     locked = np.hypot(m[..., 2, 0], m[..., 2, 2]) < _LOCKED

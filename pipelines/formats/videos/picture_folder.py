@@ -204,10 +204,7 @@ class PictureFolder:
 
 
 def taken_ns(path: Path) -> tuple[Int64 | None, bool]:
-    """Return when each picture of a folder was taken, ns, and True if some share a second (`picture_times`).
-
-    The times are None if a picture has none or they do not rise.
-    """
+    """Return when pictures were taken, ns (None: some lack it or fall), and if some share a second."""
     t_ns, shared = picture_times([read_tags(file) for file in picture_files(path)])
     return (t_ns if t_ns.all() and (np.diff(t_ns) > 0).all() else None), shared
 

@@ -113,10 +113,7 @@ def _open_stream(width: int, height: int) -> VideoCodecContext:
 
 
 def join_videos(path: Path, parts: Sequence[Path]) -> None:
-    """Join parts that were encoded alike to one video; their stamps continue from part to part.
-
-    The coded pictures are copied, so nothing is lost.
-    """
+    """Join the coded pictures of parts that were encoded alike; their stamps continue from part to part."""
     import av
 
     if not parts:
