@@ -205,7 +205,7 @@ def ingest(
 
 
 class _FlightReader:
-    """Reader that stores the parts of one flight, collects doubts as notes, and closes the logs at the end."""
+    """Reader that stores the parts of one flight, collects doubts as notes, and closes its logs."""
 
     def __init__(
         self, flight: Manifest, flight_path: Path, session: Path, interpolation: Interpolation

@@ -129,7 +129,7 @@ class Bias(_Stationary):
 
 @dataclass(frozen=True, kw_only=True)
 class GaussMarkov(_Stationary):
-    """An error with the autocorrelation exp(-lag / correlation_s) (Gelb 1974, 3.8), as of satellites."""
+    """An error that decorrelates with a correlation time, like that of satellite positioning."""
 
     correlation_s: float
 
@@ -140,6 +140,7 @@ class GaussMarkov(_Stationary):
 
     def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
         draw = rng.standard_normal((len(elapsed_s), 6))
+        # Gelb 1974, Applied Optimal Estimation, 3.8.
         kept = np.exp(-np.diff(elapsed_s) / self.correlation_s)
         fresh = np.sqrt(-np.expm1(-2 * np.diff(elapsed_s) / self.correlation_s))
         for k in range(1, len(draw)):
