@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -88,7 +88,14 @@ def load_cameras(
     sources = _keypoints(folder, description, detected)
     if not sources:
         raise NoViewsError(description.flight, "has no camera with pictures or keypoints", "add one")
-    joints = _common_joints(folder, sources)
+    # List the joints that two cameras know, or the only one, in the order of the camera that knows most.
+    known, least = [source.joints for source in sources.values()], min(2, len(sources))
+    shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) >= least]
+    if not shared:
+        raise DataError(
+            folder, "has no joint that two cameras' detectors both know", "use one skeleton for all"
+        )
+    joints = tuple(shared)
     warnings: list[str] = []
     cameras = []
     for name, source in sources.items():
@@ -97,17 +104,6 @@ def load_cameras(
         noise = stated_noise(name, entry, camera.trajectory, pose_noise)
         cameras.append(replace(camera, sigma=noise.sigma, covariance=noise.covariance))
     return cameras, warnings
-
-
-def _common_joints(folder: Path, sources: Mapping[str, _Keypoints]) -> tuple[str, ...]:
-    """List the joints that two cameras know, or the only one, in the order of the camera that knows most."""
-    known, least = [source.joints for source in sources.values()], min(2, len(sources))
-    shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) >= least]
-    if not shared:
-        raise DataError(
-            folder, "has no joint that two cameras' detectors both know", "use one skeleton for all"
-        )
-    return tuple(shared)
 
 
 def _load_camera(

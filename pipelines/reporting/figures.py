@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import rotate
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.chart import (
@@ -147,20 +147,17 @@ def _camera_marks(camera: CameraRow, track: Trajectory, k: int, origin: Float, e
     looking = line_through(strokes, colour, width=0.8)
     if still:
         return [points_at(ground[:1], colour, camera.name, marker="s", size=5), looking]
-    path = _drawn_path(track.t_ns, ground, [start for start, _ in camera.entry.poses.gaps_ns])
+    stride = stride_for(len(ground))
+    breaks = np.unique(
+        np.searchsorted(track.t_ns, [start for start, _ in camera.entry.poses.gaps_ns], side="right")
+    )
+    pieces = []
+    for rows in np.split(np.arange(len(ground)), breaks):
+        if rows.size:
+            pieces += [ground[np.unique([*rows[::stride], rows[-1]])], np.full((1, 2), np.nan)]
+    path = np.concatenate(pieces) if pieces else ground
     start = points_at(ground[:1], colour, filled=False)
     return [line_through(path, colour, camera.name, style=style), start, looking]
-
-
-def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> Float:
-    """Return a decimated path, broken where the poses have a gap."""
-    stride = stride_for(len(path))
-    breaks = np.unique(np.searchsorted(t_ns, gap_starts_ns, side="right"))
-    pieces = []
-    for rows in np.split(np.arange(len(path)), breaks):
-        if rows.size:
-            pieces += [path[np.unique([*rows[::stride], rows[-1]])], np.full((1, 2), np.nan)]
-    return np.concatenate(pieces) if pieces else path
 
 
 def _joints_and_bones(summary: Summary) -> Figure:

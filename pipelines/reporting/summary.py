@@ -42,7 +42,7 @@ from pipelines.reporting.wording import (
     whole,
 )
 from pipelines.session.camera_poses import logged_covariance
-from pipelines.session.description import CameraEntry, ClockEntry, Description, Doubt
+from pipelines.session.description import CameraEntry, Description, Doubt
 from pipelines.session.people import true_joints_at
 from pipelines.session.tables import figures_by_joint, motion_from, trajectory_from
 
@@ -379,21 +379,17 @@ def _quality(content: SessionContent, summary: Summary, camera: CameraRow) -> li
     offset = quantity(clock.offset_s, "s", 3)
     if found is not None:
         offset += f" {'+' if found >= 0 else ''}{quantity(found, 's', 3)}"
+    found_s = number(section(summary.metrics, "clock_offset_sigmas_s"), camera.name)
+    sigma_s = clock.prior_sigma_s
+    words = f"±{THIN}{quantity(sigma_s, 's', 3)}" if sigma_s else "known"
+    words += {"stated": "", "assumed": ", assumed", "none": ", not stated"}[clock.start]
     return [
         camera.name,
         _stated_noise(camera, content.poses.get(camera.name)),
         offset,
-        _clock_words(clock, number(section(summary.metrics, "clock_offset_sigmas_s"), camera.name)),
+        f"{words}; estimated to ±{THIN}{quantity(found_s, 's', 3)}" if found_s else words,
         *(percent(share) for share in _detection(content, camera)),
     ]
-
-
-def _clock_words(clock: ClockEntry, found_s: float | None) -> str:
-    """Describe how surely a clock is known: by flight.yaml, and where it was estimated after that."""
-    sigma_s = clock.prior_sigma_s
-    words = f"±{THIN}{quantity(sigma_s, 's', 3)}" if sigma_s else "known"
-    words += {"stated": "", "assumed": ", assumed", "none": ", not stated"}[clock.start]
-    return f"{words}; estimated to ±{THIN}{quantity(found_s, 's', 3)}" if found_s else words
 
 
 def _stated_noise(camera: CameraRow, poses: pd.DataFrame | None) -> str:

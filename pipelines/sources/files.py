@@ -294,7 +294,8 @@ def hash_sources(flight: Manifest, base: Path, progress: Progress) -> dict[str, 
     progress.start("Hashing sources", len(unique))
     hashes = {}
     for path in unique:
-        hashes[path] = _hash_of(located(base, path))
+        digests = [sha256_of(file) for file in _source_files(located(base, path))]
+        hashes[path] = digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
         progress.advance()
     return hashes
 
@@ -324,12 +325,6 @@ def refuse_written(flight: Manifest, base: Path, stamps: Mapping[str, str]) -> N
             problem = "was written to while it was being read"
             remedy = "run `mocap ingest` again when it is complete"
             raise DataError(named(base, path), problem, remedy, code="changed")
-
-
-def _hash_of(path: Path) -> str:
-    """Compute the sha256 of a source; that of a floor plan includes its picture."""
-    digests = [sha256_of(file) for file in _source_files(path)]
-    return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
 
 
 def _source_files(path: Path) -> list[Path]:

@@ -537,17 +537,13 @@ class FlightPoses:
             attitude = None if pose.by_pictures else pose.attitude
             found = read_pair(recording, source, pose.topic or "", attitude, axes, stamps)
             if not (pose.axes or opened.settings.axes):
-                found = self._upright_pair(found)
+                turn, track, body = turn_of(self._upright), found.position, found.body
+                if not track.on_earth:
+                    track = replace(track, values=self._upright.scale * rotate(turn, track.values))
+                if body is not None:
+                    body = replace(body, quaternion_xyzw=multiply(turn, body.quaternion_xyzw))
+                found = replace(found, position=track, body=body)
             return replace(found, dropped=dict(Counter(found.dropped) + opened.lost))
-
-    def _upright_pair(self, telemetry: Telemetry) -> Telemetry:
-        """Turn positions and attitudes of separate topics upright, and scale positions that are in metres."""
-        turn, track, body = turn_of(self._upright), telemetry.position, telemetry.body
-        if not track.on_earth:
-            track = replace(track, values=self._upright.scale * rotate(turn, track.values))
-        if body is not None:
-            body = replace(body, quaternion_xyzw=multiply(turn, body.quaternion_xyzw))
-        return replace(telemetry, position=track, body=body)
 
     def log_clock(self, camera: CameraSources) -> ClockFit | None:
         """Return the fit of a drone's log clock to GPS time; None without one."""

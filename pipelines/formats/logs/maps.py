@@ -192,7 +192,8 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
     if not changes:
         raise lost.nothing_usable()
     notes = lost.notes()
-    kept = _spread(changes)
+    most = max(1, min(MOST_MAPS, MOST_VOXELS // max(change.voxels for change in changes)))
+    kept = [changes[row] for row in evenly(len(changes), most)]
     if len(kept) < len(changes):
         lost.counts[NOT_KEPT] += len(changes) - len(kept)
         notes.append(
@@ -240,12 +241,6 @@ def _made_again(
             made = _made(message, about)
             if made is not None:
                 yield made
-
-
-def _spread(changes: list[_Change]) -> list[_Change]:
-    """Choose as many changes as may be kept, evenly spaced, with the first and the last."""
-    most = max(1, min(MOST_MAPS, MOST_VOXELS // max(change.voxels for change in changes)))
-    return [changes[row] for row in evenly(len(changes), most)]
 
 
 def _digest(occupancy: Occupancy) -> bytes:

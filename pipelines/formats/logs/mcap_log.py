@@ -80,7 +80,10 @@ class McapPart(ChunkedPart):
                     break
                 self.count_record()
                 if kind == _MESSAGE:
-                    index.append(_message_row(content, position))
+                    _, _, channel, _, stamp, _ = _MESSAGE_HEAD.unpack_from(content, position)
+                    if stamp >= _STAMP_LIMIT:
+                        raise ValueError("a stamp after the year 2262")
+                    index.append((channel, stamp, position))
                 elif kind in {_SCHEMA, _CHANNEL}:
                     self._take_record(kind, bytes(content[position + _HEAD.size : end]), channels)
                 position = end
@@ -148,13 +151,6 @@ class McapPart(ChunkedPart):
         return np.stack(
             [np.full(len(raw), channel), raw["stamp"].astype(np.int64), raw["place"].astype(np.int64)], axis=1
         )
-
-
-def _message_row(content: memoryview | bytes, position: int) -> tuple[int, int, int]:
-    _, _, channel, _, stamp, _ = _MESSAGE_HEAD.unpack_from(content, position)
-    if stamp >= _STAMP_LIMIT:
-        raise ValueError("a stamp after the year 2262")
-    return channel, stamp, position
 
 
 FORMAT = LogFile("mcap", "MCAP log", (".mcap",), _MAGIC, McapPart)

@@ -93,11 +93,16 @@ def _add_person(
         if known.any():
             size = np.where(known[:, None], np.stack([known, length, known], axis=1), 0.0)
             side = _side(start) if _side(start) == _side(end) else ""
+            direction = held(np.where(known[:, None], span, np.nan))
+            x, y, z = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).T
+            turn = np.stack([z, np.zeros_like(x), -x, 1 + y], axis=1)
+            turn[1 + y < 1e-12] = [1.0, 0.0, 0.0, 0.0]
+            turned: Float = turn / np.linalg.norm(turn, axis=1, keepdims=True)
             asset.moving(
                 f"{label}{start} to {end}",
                 bars[side],
                 translation=held(np.where(known[:, None], low, np.nan)),
-                rotation=_turned_to(held(np.where(known[:, None], span, np.nan))),
+                rotation=turned,
                 scale=size,
             )
 
@@ -131,15 +136,6 @@ def held(values: Float) -> Float:
     known = np.isfinite(values[:, 0])
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return values[np.where(last < 0, int(np.argmax(known)), last)]
-
-
-def _turned_to(direction: Float) -> Float:
-    """Return the smallest turns [T, 4] xyzw of the y axis to directions [T, 3] of any length."""
-    x, y, z = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).T
-    turn = np.stack([z, np.zeros_like(x), -x, 1 + y], axis=1)
-    turn[1 + y < 1e-12] = [1.0, 0.0, 0.0, 0.0]
-    turned: Float = turn / np.linalg.norm(turn, axis=1, keepdims=True)
-    return turned
 
 
 def _octahedron(radius: float) -> tuple[Float, Int64]:

@@ -301,8 +301,14 @@ def write_joints(
     step = METRES["mm"] / METRES[unit]  # a residual's unit is POINT:SCALE
     file = ezc3d.c3d()
     file["data"]["points"] = points
+    steps = np.zeros(missing.shape)
+    if motion.covariance is not None:
+        trace = motion.covariance[:, person][..., [0, 3, 5]].sum(axis=-1).T
+        sigma_mm = 1000 * np.sqrt(np.where(np.isfinite(trace), np.maximum(trace, 0.0), 0.0) / 3)
+        steps = np.minimum(np.rint(sigma_mm), _MOST_RESIDUAL)
+    # ezc3d truncates the decimals: a quarter more keeps 7 from becoming 6.9999.
     file["data"]["meta_points"] = {
-        "residuals": _residuals(motion, person, missing, step)[None],
+        "residuals": np.where(missing, -1.0, (steps + 0.25) * step)[None],
         "camera_masks": np.zeros((7, *missing.shape), bool),
     }
     names = [" ".join(marker_name(joint).split()) or "_" for joint in motion.joints]
@@ -332,17 +338,6 @@ def _add_events(file: Any, events: pd.DataFrame, first_ns: int) -> None:
     file.add_parameter("EVENT", "CONTEXTS", events["side"].str.capitalize().tolist())
     file.add_parameter("EVENT", "LABELS", [_EVENTS[event] for event in events["event"]])
     file.add_parameter("EVENT", "TIMES", np.array(np.divmod(since_s, 60.0)))
-
-
-def _residuals(motion: JointMotion, person: int, missing: Any, step: float) -> Float:
-    """Return standard deviations [N, T] in whole steps; 0 if unknown, -1 if the point is missing."""
-    steps = np.zeros(missing.shape)
-    if motion.covariance is not None:
-        trace = motion.covariance[:, person][..., [0, 3, 5]].sum(axis=-1).T
-        sigma_mm = 1000 * np.sqrt(np.where(np.isfinite(trace), np.maximum(trace, 0.0), 0.0) / 3)
-        steps = np.minimum(np.rint(sigma_mm), _MOST_RESIDUAL)
-    # ezc3d truncates the decimals: a quarter more keeps 7 from becoming 6.9999.
-    return np.where(missing, -1.0, (steps + 0.25) * step)
 
 
 def _unique(names: Sequence[str], longest: int = _LONGEST_TEXT) -> list[str]:

@@ -115,7 +115,9 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
     if off_ns <= _KEPT_NS:
         if off_ns > 1000:
             progress.note(f"{source}: times are up to {off_ns / 1e6:.3f} ms off a constant rate; kept")
-        even = _spread(motion, even_ns, index)
+        row = np.full(len(even_ns), -1)
+        row[index] = np.arange(len(index))
+        even = _taken(motion, row, replace(motion, t_ns=even_ns, position=_rows(motion.position, row)))
     else:
         progress.note(
             f"{source}: times are up to {off_ns / 1e6:.3f} ms off a constant rate; "
@@ -123,12 +125,6 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
         )
         even = _interpolated(motion, even_ns, round(_LONGEST_STEP * step_ns))
     return EvenMotion(even, 1e9 / step_ns, frames - len(t_ns))
-
-
-def _spread(motion: JointMotion, even_ns: Int64, index: Int64) -> JointMotion:
-    row = np.full(len(even_ns), -1)
-    row[index] = np.arange(len(index))
-    return _taken(motion, row, replace(motion, t_ns=even_ns, position=_rows(motion.position, row)))
 
 
 def _interpolated(motion: JointMotion, even_ns: Int64, longest_ns: int) -> JointMotion:
@@ -440,7 +436,12 @@ class AnglesExport:
         name = safe_file_name(recording.name)
         paths = [folder / f"{name}_angles.csv"]
         table.to_csv(paths[0], index=False, lineterminator="\n")
-        t_ns, value, sigma = _by_angle(table)
+        people = int(table["person"].max()) + 1
+        shape = (-1, people, len(ANGLES))
+        t_ns = table["t_ns"].to_numpy(np.int64).reshape(shape)[:, 0, 0]
+        value, sigma = (
+            table[name].to_numpy(np.float64).reshape(shape) for name in ("value_deg", "sigma_deg")
+        )
         known = np.flatnonzero(np.isfinite(value).any(axis=(0, 2))).tolist()
         named = file_names_of_people(recording, value.shape[1])
         for person in known:
@@ -450,15 +451,6 @@ class AnglesExport:
             if left_out:
                 recording.progress.note(f"angles: {paths[-1].name} leaves out {left_out}, not known")
         return sorted(paths)
-
-
-def _by_angle(table: pd.DataFrame) -> tuple[Int64, Float, Float]:
-    """Return times [T], and values and standard deviations [T, P, A], of rows in the order of the session."""
-    people = int(table["person"].max()) + 1
-    shape = (-1, people, len(ANGLES))
-    t_ns = table["t_ns"].to_numpy(np.int64).reshape(shape)[:, 0, 0]
-    value, sigma = (table[name].to_numpy(np.float64).reshape(shape) for name in ("value_deg", "sigma_deg"))
-    return t_ns, value, sigma
 
 
 def write_sto(path: Path, t_ns: Int64, value_deg: Float, sigma_deg: Float) -> str:
