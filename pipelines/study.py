@@ -424,11 +424,7 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
 
 
 def _walks(stated: Stated, flight: LoggedFlight, maps: Sequence[Occupancy]) -> dict[str, LoggedFlight]:
-    """Return the flights of the walks that `actor` asks for, by the names of the walks.
-
-    A number is so many walks: the logged one, and others by chance. Else each value is one, for example
-    `speed:0.8+delay:2+turn:-30`. DataError: a value cannot be read, or a way is turned into an obstacle.
-    """
+    """Return the flights of the walks that `actor` asks for: a number of them, or one for each value."""
     texts = stated.get("actor", ())
     if len(texts) != 1 or not texts[0].isdigit():
         return {text: walked_otherwise(flight, _walk_of(text), maps) for text in texts}

@@ -229,12 +229,7 @@ def _quaternion_in(headings: list[str]) -> tuple[str, ...] | None:
 
 
 def _is_vins_mono(line: str, written: str = "") -> bool:
-    """Test for VINS-Mono: nanoseconds, position, quaternion with w first, and velocity or a comma at the end.
-
-    Args:
-        line: the first line of numbers, with single spaces between them.
-        written: the line as it stands in the file.
-    """
+    """Test for VINS-Mono: ns, position, quaternion with w first, velocity or (in `written`) a last comma."""
     numbers = _numbers_of(line)
     length = 8 if written.rstrip().endswith(",") and len(numbers) == 8 else 11
     return len(numbers) == length and numbers[0] > 1e17 and abs(math.hypot(*numbers[4:8]) - 1) < 1e-2
@@ -314,12 +309,7 @@ def is_airsim(head: str) -> bool:
 
 
 def _read_csv(path: Path) -> Trajectory:
-    """Read every pose below a heading of any order, separated by commas, semicolons or tabs.
-
-    Needed: a time (`stamp_column`), x y z (also tx, p_x, pos_x, position_x), qx qy qz qw (also q_x,
-    orientation_x, q_RS_x). Optional: the covariance c00..c55, upper triangle, position in world and rotation
-    vector in body.
-    """
+    """Read poses below a heading of any order: a time, x y z, qx qy qz qw, perhaps a covariance c00..c55."""
     text = read_text(path)
     found = find_poses(text)
     if found is None:

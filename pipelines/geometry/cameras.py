@@ -235,10 +235,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
 
 
 def _invert(function: Callable[[Float], tuple[Float, Float]], target: Float, limit: float) -> Float:
-    """Solve f(u) = target on [0, limit] for an f that grows there; the limit where f stays below.
-
-    Newton's method, with bisection where a step would leave the bracket. `function` returns f and f'.
-    """
+    """Solve f(u) = target on [0, limit] by Newton and bisection for an f (with f') that grows; or limit."""
     low, high = np.zeros_like(target), np.full_like(target, limit)
     solution = np.minimum(target, limit)
     for _ in range(100):

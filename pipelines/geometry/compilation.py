@@ -110,11 +110,7 @@ event.register("numba:compile", _ANNOUNCEMENT)
 
 
 def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
-    """Validate the cache by the contents of the files of the function and its helpers.
-
-    numba has no public interface for this. If its internals differ, the cache checks the age of the outermost
-    file.
-    """
+    """Validate numba's cache by the files of the function and its helpers, if its internals allow."""
     files = {function.__code__.co_filename}
     waiting = [function]
     while waiting:

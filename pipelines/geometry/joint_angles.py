@@ -247,10 +247,7 @@ def _hip_rotation(points: Float, side: float) -> Float:
 
 
 def _knee(points: Float, side: float) -> Float:
-    """Compute the flexion from hips, knee and ankle.
-
-    The hinge's axis is the normal of the leg's plane, drawn towards the hips' line next to straight.
-    """
+    """Compute the flexion about the normal of the leg's plane; next to straight, about the hips' line."""
     thigh, shank = _unit(points[2] - points[0 if side < 0 else 1]), _unit(points[3] - points[2])
     normal = _cross(shank, thigh)  # to the right, as long as the sine of the bend
     lateral = _unit(_across(points[1] - points[0], thigh))

@@ -119,11 +119,8 @@ def _linearise(
 def _refine(
     view: Float, used: Bool, camera: Float, start: Vector, hopeless: float
 ) -> tuple[float, float, float, float, float]:
-    """Refine a point by Gauss-Newton on the whitened reprojection errors of the used views.
-
-    The result is never worse than the start. The function stops if the linear model predicts a cost above
-    `hopeless`. It returns the point, the cost and the largest term.
-    """
+    """Refine a point by Gauss-Newton, never to a worse one; return it, the cost and the largest term."""
+    # It stops where the linear model predicts a cost above `hopeless`.
     x, y, z = start
     dx = dy = dz = 0.0
     before = math.inf

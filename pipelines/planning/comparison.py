@@ -69,11 +69,8 @@ def mean_over_time(values: Float, t_ns: Int64, seed: int) -> MeanWithInterval | 
 
 
 def _ratio(sums: Float, weights: Float, t_ns: Int64 | None = None) -> MeanWithInterval | None:
-    """Compute a ratio of totals [K, T] over trials and times; None where nothing has a weight.
-
-    The interval is Student's over the trials. With `t_ns` [T] the trials share one film, whose errors are a
-    draw, too: its interval over stretches is added, as independent errors are.
-    """
+    """Compute a ratio of totals [K, T] over trials and times; None where nothing has a weight."""
+    # With `t_ns` the trials share one film, whose errors are a draw, too: its own interval is added.
     if not weights.sum() > 0:
         return None
     mean = float(sums.sum() / weights.sum())

@@ -686,10 +686,7 @@ def _probability_at(occupancy: Occupancy, points: Float) -> Float:
 
 
 def _ground_above_feet(occupancy: Occupancy, hips: Float) -> Float:
-    """Compute how far the map's ground is above the feet [K] of hips [K, 3]; NaN where it shows none.
-
-    The ground is the top of the lowest occupied voxels of a column: others may be roofs.
-    """
+    """Compute how far the ground, a column's lowest occupied voxels, is above the feet of hips [K, 3]."""
     place = np.floor((hips - occupancy.origin) / occupancy.resolution_m).astype(np.int64)[:, :2]
     inside = ((place >= 0) & (place < occupancy.probability.shape[:2])).all(axis=1)
     above = np.full(len(hips), np.nan)

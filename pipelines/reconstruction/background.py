@@ -199,10 +199,7 @@ class PosePrior:
 
 
 def _unknown(number: int, rate: float) -> Process:
-    """Build the process of slow errors that nobody stated, from their rate (m or rad per sqrt(s)).
-
-    It is stationary: a random walk from zero would take the first pose of the log as exact.
-    """
+    """Build the stationary process of slow errors that nobody stated, from their rate (per root of s)."""
     return Process(number, rate * float(np.sqrt(_SLOW_S / 2)), correlation_s=_SLOW_S)
 
 
@@ -654,11 +651,8 @@ class _Stretch:
         return state, _Factored(factor, both[:, :-1], covariance), missed[np.isfinite(missed)]
 
     def _design(self, rotation: Float, prior: PosePrior) -> Float:
-        """Compute the derivatives [T, 6, 9 or 10] of the errors by the constant ones.
-
-        A picture that was taken later than its stamp shows a camera that has turned farther than the log's.
-        The position tells nothing of a clock: the background does not show where the whole path lies.
-        """
+        """Compute the derivatives [T, 6, 9 or 10] of the errors by the constant ones."""
+        # A late picture is turned farther than its log says; its position tells nothing of a clock.
         design = np.zeros((len(rotation), 6, len(_sigma_of_constants(prior))))
         design[:, :3, :3] = design[:, 3:, 3:6] = np.eye(3)
         design[:, :3, 6:9] = self.rotation
@@ -836,11 +830,7 @@ def _place_of_standing(t_s: Float, position: Float, prior: PosePrior) -> tuple[F
 
 
 def _pieces(picture: Int64, point: Int64, longest: int) -> tuple[Bool, Int64]:
-    """Cut tracks, sorted by point and picture, into pieces; choose as many as are needed in a picture.
-
-    Returns:
-        The sightings [K] that are used, and the first of each piece among these and their number [N + 1].
-    """
+    """Cut tracks, sorted by point and picture; return the sightings used, and each piece's first of them."""
     if not len(picture):
         return np.zeros(0, dtype=np.bool_), np.zeros(1, dtype=np.int64)
     begins = np.append(True, (np.diff(point) != 0) | (np.diff(picture) != 1))

@@ -205,10 +205,7 @@ def _height_of(
 
 
 def _with_second_drone_mm(views: Views, result: Triangulation, pose_sigma: Float) -> float | None:
-    """Predict the error with a second drone as far away, whose rays cross at right angles.
-
-    With the error s of a ray across, the trace of the covariance is 2.5 s^2 (docs/estimate.md).
-    """
+    """Predict the error with a second drone at right angles: a ray's error s gives the trace 2.5 s^2."""
     known = np.isfinite(result.points).all(axis=1)
     if not known.any():
         return None

@@ -180,10 +180,7 @@ def load_pose_errors(
 
 
 def _prior_of(models: Sequence[NoiseModel], camera: Camera) -> PoseErrors:
-    """Build the prior from stated models; for models of plug-ins, from the size of their errors alone.
-
-    A drift begins with the log, and has a size already in the first picture.
-    """
+    """Build the prior from stated models; for models of plug-ins, from the size of their errors alone."""
     try:
         elapsed_s = max(float(camera.frame_t_ns[0] - camera.trajectory.t_ns[0]) / 1e9, 0.0)
         return pose_errors(models).later(elapsed_s)

@@ -424,11 +424,7 @@ def _fit(points: StandingPoints, t_ns: Int64, rays: Rays, poses: Poses, shared: 
 
 
 class _Chain:
-    """Poses of a window, eliminated in the order of time.
-
-    `step` [N, D] and `answer` [N, D, G] solve the equations of poses for the right sides and for what
-    couples them with shared unknowns.
-    """
+    """Poses of a window, eliminated in time order: `step` solves the right sides, `answer` the coupling."""
 
     def __init__(self, normal: Normal, motion: _Motion, damping: float) -> None:
         from scipy.linalg import cho_factor, cho_solve

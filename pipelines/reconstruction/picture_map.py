@@ -324,10 +324,7 @@ def _read_model(model: Any, features: Sequence[KeyFeatures], focal_px: float) ->
 
 
 def _determines_focal(model: Any) -> bool:
-    """Test if a bundle adjustment that starts with another focal length comes back to the map's.
-
-    Straight down over flat ground it does not: there focal length and height are one unknown.
-    """
+    """Test if a bundle adjustment with another focal length comes back; straight down on flat ground: no."""
     import pycolmap
 
     other = pycolmap.Reconstruction(model)
@@ -527,11 +524,7 @@ def _first_similarity(mapped: Float, logged: Float) -> tuple[_Similarity, Bool]:
 
 
 def _upright(start: _Similarity, mapped: Float, logged: Float, factor: Float, turned: Float) -> _Similarity:
-    """Turn a similarity about the main direction of the path to where the horizon is level.
-
-    A straight path leaves this turn open, and a nearly straight one leaves it to noise. Cameras are taken to
-    stand upright, or to look down.
-    """
+    """Turn a similarity about the path's main direction, which hardly determines it, to a level horizon."""
     from scipy.linalg import solve_triangular
 
     axis = np.linalg.svd(logged - logged.mean(axis=0))[2][0]

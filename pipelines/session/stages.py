@@ -570,11 +570,7 @@ def _repair(folder: Path) -> None:
 
 
 def _roll_forward(folder: Path, stage: str) -> None:
-    """Publish a complete `<stage>.new`.
-
-    Every step can be repeated, and the stage's folder, with its record, is renamed last. After a kill between
-    any two steps, or a loss of power, doing all of them again completes the publication.
-    """
+    """Publish a complete `<stage>.new` by steps that can be repeated; the stage's folder is renamed last."""
     new, old = _new_folder(folder, stage), _old(folder, stage)
     record = read_record(new / "stage.json")
     published = {name.partition("/")[0] for name in record.outputs}

@@ -228,10 +228,7 @@ def read_rows(path: Path, schema: pa.Schema, name: str, chosen: Int64) -> pd.Dat
 
 
 def _batches(opened: Any, columns: Sequence[str] | None = None) -> Iterator[Any]:
-    """Yield the rows of a Parquet file in small batches, one row group after the other.
-
-    A single iterator over all groups would hold memory of each until its end: 1.5 GB for 14.6 million rows.
-    """
+    """Yield a Parquet file's rows group by group: one iterator over all held 1.5 GB for 14.6 million rows."""
     for group in range(opened.metadata.num_row_groups):
         yield from opened.iter_batches(ROWS_PER_BATCH, row_groups=[group], columns=columns)
 

@@ -180,11 +180,8 @@ def _camera_info(message: Message, source: Source) -> Iterator[Sample]:
 
 
 def _lens(message: Message, source: Source, matrix: Float, distortion: list[float]) -> tuple[Intrinsics, str]:
-    """Return the intrinsics of the pictures beside a CameraInfo, and a note.
-
-    Some drivers state binning with a K that is of the binned pictures already. The principal point tells: it
-    is in the middle of the binned pictures, and undivided it is far off theirs, or the other way round.
-    """
+    """Return the intrinsics of the pictures beside a CameraInfo, and a note."""
+    # Some drivers state binning with a K of the binned pictures: then its principal point is in their middle.
     value, topic = message.value, message.topic.name
     model = value.distortion_model.lower()
     known = _FISHEYE_MODELS | _RADTAN_MODELS

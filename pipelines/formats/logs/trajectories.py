@@ -396,10 +396,7 @@ def _take_out_gaps(log: OpenLog, part: LogPart, densest: Int64) -> None:
 
 
 def _written_bodies(log: OpenLog, part: LogPart) -> list[LoggedRows]:
-    """Return the bodies of a part's topic of most poses, the densest first, in the order of writing.
-
-    The numbers of their rows are in place of the stamps of receipt.
-    """
+    """Return a topic's bodies with most poses, densest first, as written; rows' numbers stand for stamps."""
     topics = [topic for topic in log.topics if kind_of(topic) in {"poses", "transforms"} and topic.count]
     if not topics:
         return []

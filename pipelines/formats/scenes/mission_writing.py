@@ -166,10 +166,7 @@ def _waypoints(flight: _Flight) -> list[_Waypoint]:
 
 
 def _bends(flight: _Flight) -> tuple[Int64, Int64]:
-    """Choose the rows of waypoints by Ramer, Douglas and Peucker, and for each the row at which it is left.
-
-    At bends that are too near to the waypoint before, the drone still waits there.
-    """
+    """Choose the rows of waypoints (Ramer, Douglas and Peucker), and for each the row at which it is left."""
     values = np.column_stack(
         [
             flight.ned / _WAYPOINT_ERROR_M,

@@ -43,12 +43,7 @@ class _TrcHeader:
 
 
 def _read(path: Path, unit: str | None, axes: str | None) -> JointMotion:
-    """Read every row of one person; blank cells and NaN are missing.
-
-    Pose2Sim's markers get our joint names (RHip is right_hip), others keep theirs. A `unit` stated by the
-    user overrides the header's Units, because files in mm often claim m. `axes` is y-up unless stated:
-    world = (z, x, y) of the file.
-    """
+    """Read every row of one person; a stated `unit` overrides the header: files in mm often claim m."""
     header, rows, first_line = _split(path, read_text(path))
     times, values = _numbers(path, rows, len(header.markers), first_line)
     t_ns, readable = parse_stamps(path, times)

@@ -254,10 +254,7 @@ def _gains(
 def _left(
     camera: Camera, turns: Turns, between: Interpolation, first_ns: Int64, second_ns: Int64
 ) -> tuple[Float, Float]:
-    """Return the angles [N] by which the log turns otherwise at given times, and by which it turns.
-
-    They are NaN without poses.
-    """
+    """Return the angles [N] by which the log turns otherwise at given times, and turns; NaN without poses."""
     start, before = camera.poses_at(first_ns, between)
     end, after = camera.poses_at(second_ns, between)
     back = np.swapaxes(after, 1, 2)

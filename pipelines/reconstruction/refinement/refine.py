@@ -413,11 +413,7 @@ def _priors(
     *,
     measured: bool,
 ) -> Iterator[_Prior]:
-    """Yield parameters of the prior from stretches of the flight, then alternatives if a check refuses them.
-
-    Raises:
-        LinAlgError: none of them explains the pictures.
-    """
+    """Yield parameters of the prior from stretches of the flight, then alternatives if a check refuses."""
     cameras = len(clock_sigma_s)
     guess, image, disagreement_m, _ = _first_guess(problem, start)
     if prior is not None:
@@ -447,11 +443,7 @@ def _priors(
 def _known_prior(
     problem: Problem, start: Float, prior: Sequence[PoseErrors], clock_sigma_s: Float
 ) -> Iterator[_Prior]:
-    """Yield the prior with known pose errors; motion, bones and keypoint noise are learned beside them.
-
-    Constant errors that are only assumed have estimated levels, then usual ones. If a check refuses both,
-    they are held as logged: motion, bones and what changes in the poses are estimated all the same.
-    """
+    """Yield priors with known pose errors: assumed constants of estimated or usual levels, or as logged."""
     guess, _, disagreement_m, range_m = _first_guess(problem, start)
     unlearned = _unlearned(problem, start, tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start)
@@ -479,10 +471,7 @@ def _known_prior(
 
 
 def _usual_levels(guessed: Mapping[int, float]) -> dict[int, float]:
-    """Return usual levels of constant errors by kind, or those guessed from the views if they are smaller.
-
-    What pictures hardly determine follows the detector's lasting errors, as far as the level allows.
-    """
+    """Return usual levels of constant errors by kind, or those guessed from the views if they are smaller."""
     return {kind: min(USUAL_CONSTANT[kind], sigma) for kind, sigma in guessed.items()}
 
 

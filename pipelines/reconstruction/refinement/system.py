@@ -237,11 +237,7 @@ def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
 
 
 def _rates(sighting: Sighting) -> tuple[Float, Float]:
-    """Compute speed [F, 3] (m/s) in the world and turn rate [F, 3] (rad/s) in the camera; 0 where unknown.
-
-    Rates are taken over half a second. From picture to picture, noisy poses would give rates larger than
-    people's motion, and estimated clock offsets would be too small.
-    """
+    """Compute speed [F, 3] (m/s, world) and turn rate [F, 3] (rad/s, camera) over half a second; or 0."""
     count = len(sighting.t_s)
     if count < 3:
         return np.zeros((count, 3)), np.zeros((count, 3))
