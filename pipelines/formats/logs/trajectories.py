@@ -424,7 +424,8 @@ def _take_out_gap(log: OpenLog, part: LogPart, rows: Int64, gap: StampGap, bodie
         > max(1.5 * gap.usual_s, abs(gap.excess_s) / 4) + uneven_s
     ):
         return  # other messages were received in the gap
-    after_s = int(part.received_ns[rows[gap.index - 1]] - part.received_ns[rows[0]]) / 1e9
+    started_ns = min(int(each.received_ns.min()) for each in log.parts if len(each.received_ns))
+    after_s = (int(part.received_ns[rows[gap.index - 1]]) - started_ns) / 1e9
     told = f"all stamps step by {gap.excess_s:+.3f} s at {after_s:.2f} s"
     stepped = True if gap.goes_back else _clock_stepped(part, bodies, gap, last)
     if stepped and abs(gap.excess_s) <= MAX_STEP_S:
