@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -155,7 +156,7 @@ def describe_motion(motion: JointMotion) -> dict[str, object]:
         "rows": len(motion.t_ns),
         "people": motion.position.shape[1],
         "joints": list(motion.joints),
-        **describe_times(motion.t_ns),
+        **(describe_times(motion.t_ns) if motion.timed else {"times": "none: its frames are counted"}),
         "missing_share": round(float(np.isnan(motion.position).any(axis=-1).mean()), 4),
         **bounding_box(motion.position.reshape(-1, 3)),
     }
@@ -186,7 +187,7 @@ def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
     names: dict[str, None] = {}
     given = []
     for marker in markers:
-        joint = joint_called(marker) or marker
+        joint = joint_called(marker) or joint_called(marker.removeprefix("body_")) or marker  # FreeMoCap's
         given.append(marker if joint in names else joint)
         names[given[-1]] = None
     return tuple(given)
@@ -238,6 +239,8 @@ _MOST_CELLS_PER_ROW = 100
 LEAST_JOINTS_OF_WIDE = 4
 # The column of frame numbers of caliscope, and of other programs.
 _FRAME_NAMES = ("sync_index", "frame")
+# FreeMoCap's table of all points has these columns.
+_FREEMOCAP = {"frame", "model", "keypoint", "x", "y", "z"}
 
 
 @dataclass(frozen=True)
@@ -258,12 +261,15 @@ class JointFile(TextFormat):
 def _read_csv(path: Path, unit: str | None, axes: str | None) -> JointMotion:
     """Read the header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
 
-    Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope);
-    without a time their frames are counted. Metres and z up unless the user states otherwise. Rows of single
+    Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope),
+    and FreeMoCap's with a row for each frame and keypoint, in mm. Without a time their frames are counted.
+    Metres and z up unless the user states otherwise. Rows of single
     joints may come in any order; people are ranked by their number. A position that is blank, infinite or
     absent is missing (NaN).
     """
     text = read_text(path)
+    if _is_freemocap(text):
+        return _read_freemocap(path, text, unit or "mm", axes or "z-up")
     heading = _find_heading(text)
     if heading is None and (columns := _joints_of_wide(text)):
         return _read_wide(path, text, columns, unit or "m", axes or "z-up")
@@ -310,14 +316,41 @@ def _read_wide(path: Path, text: str, columns: dict[str, int], unit: str, axes: 
     numbered = next((cells.index(name) for name in _FRAME_NAMES if name in cells), None)
     heading = timed or Heading(0, ",", len(cells), numbered or 0, SECONDS, {})
     table = rows_below(path, heading, text, {}, numbers)
-    if timed or numbered is not None:
-        stamps = _stamps(path, heading, table)
-    else:
-        stamps = np.arange(len(table.text["stamp"])) * 10**9
+    has_stamps = timed is not None or numbered is not None
+    if has_stamps and pc.all(pc.equal(pc.utf8_trim_whitespace(table.text["stamp"]), "")).as_py():
+        timed, has_stamps = None, False  # FreeMoCap's column of times may be empty
+    counted = np.arange(len(table.text["stamp"])) * 10**9
+    stamps = _stamps(path, heading, table) if has_stamps else counted
     if (np.diff(stamps) <= 0).any():
         raise DataError(path, "its times do not increase", "sort its rows", code="bad-value")
     position = to_metres_z_up(path, table.stack([*numbers]).reshape(len(stamps), len(columns), 3), unit, axes)
     return JointMotion(stamps, joint_names(tuple(columns)), position[:, None], timed=timed is not None)
+
+
+def _is_freemocap(text: str) -> bool:
+    return {cell_name(cell)[0] for cell in text.split("\n", 1)[0].split(",")} >= _FREEMOCAP
+
+
+def _read_freemocap(path: Path, text: str, unit: str, axes: str) -> JointMotion:
+    """Read the keypoints of the body; hands, face, centres of mass and rigid bodies are left out."""
+    try:
+        table = pd.read_csv(StringIO(text), dtype=str, keep_default_na=False)
+    except ValueError as error:
+        raise damaged(path, error) from error
+    is_body = table["model"].str.contains("body")
+    if "trajectory" in table:
+        is_body &= table["trajectory"] == "3d_xyz"
+    table = table[is_body]
+    numbers = table[["frame", *"xyz"]].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+    if not len(table) or not (np.abs(numbers[:, 0]) < _MOST_FRAMES).all():
+        raise damaged(path, "has no keypoint of a body, or rows without a frame")
+    position = to_metres_z_up(path, numbers[:, 1:], unit, axes)
+    t_ns, names = (
+        np.rint(numbers[:, 0] * 1e9).astype(np.int64),
+        pa.chunked_array([table["keypoint"].tolist()]),
+    )
+    motion = _dense(path, t_ns, np.zeros(len(t_ns), np.int64), names, position)
+    return replace(motion, joints=joint_names(motion.joints), timed=False)
 
 
 def _find_heading(text: str) -> Heading | None:
@@ -477,7 +510,11 @@ JOINTS_CSV = JointFile(
     "joints_csv",
     "3D joints as CSV",
     (".csv", ".txt"),
-    lambda head: _find_heading(head) is not None or len(_joints_of_wide(head)) >= LEAST_JOINTS_OF_WIDE,
+    lambda head: (
+        _find_heading(head) is not None
+        or _is_freemocap(head)
+        or len(_joints_of_wide(head)) >= LEAST_JOINTS_OF_WIDE
+    ),
     _read_csv,
 )
 CSV_EXPORT = CsvExport()

@@ -118,6 +118,24 @@ def test_a_row_for_each_time_as_freemocap_writes_them(tmp_path: Path) -> None:
     frames = reader.read_joints(path, unit="mm", axes=None)
     assert (frames.t_ns.tolist(), frames.timed) == ([0, 10**9], False)
     np.testing.assert_array_equal(frames.position, motion.position)
+    blank = [f",,{row.partition(',')[2].partition(',')[2]}" for row in rows]
+    path.write_text("\n".join([f"timestamp,timestamp_by_camera,body_{head.replace(',', ',body_')}", *blank]))
+    frames = reader.read_joints(path, unit="mm", axes=None)
+    assert (frames.joints, frames.timed) == (
+        ("nose", "left_shoulder", "left_mouth", "right_hip", "body_body_com"),
+        False,
+    )
+    np.testing.assert_array_equal(frames.position, motion.position)
+    kinds = ("a_body,3d_xyz", "a_body,rigid_3d_xyz", "a_face,3d_xyz")
+    tidy = [f"{t},,{kind},left_{j},{t},2,7" for t in (0, 1) for kind in kinds for j in ("hip", "knee")]
+    path.write_text("\n".join(["frame,timestamp,model,trajectory,keypoint,x,y,z", *tidy]))
+    frames = reader.read_joints(path, unit=None, axes=None)
+    assert (frames.joints, frames.timed, frames.t_ns.tolist()) == (
+        ("left_hip", "left_knee"),
+        False,
+        [0, 10**9],
+    )
+    np.testing.assert_allclose(frames.position[1, 0], [[0.001, 0.002, 0.007]] * 2)
     np.save(tmp_path / "skeleton_3d.npy", np.zeros((4, 33, 3)))
     with refused("wrong-kind", tmp_path / "skeleton_3d.npy", "NumPy"):
         recognise(tmp_path / "skeleton_3d.npy", JointFormat, "joint file")
