@@ -54,7 +54,6 @@ def check_command(
     if not result.doubts:
         looked = f" (looked at: {result.pictures})" if result.pictures else ""
         say(f"{path}: no doubt{looked}")
-    if path.suffix in {".yaml", ".yml"}:
-        follows = "mocap check --fix {}" if result.doubts and not fix else "mocap ingest {}"
-        say_next(follows, path, shown.quiet)
+    follows = "mocap check --fix {}" if result.doubts and not fix else "mocap ingest {}"
+    say_next(follows if path.suffix in {".yaml", ".yml"} else "mocap reconstruct {}", path, shown.quiet)
     return None

@@ -199,8 +199,13 @@ def draft(
 _DRAFT = "# `mocap run` drafts it again when files are added, until you edit it: "
 
 
-_MADE = (".session", ".export")
-"""Ends of the names of folders that `mocap` makes."""
+def _is_made(folder: Path) -> bool:
+    """Test if `mocap` made a folder: a session, or an export."""
+    return folder.suffix in (".session", ".export") or _is_session(folder)
+
+
+def _is_session(folder: Path) -> bool:
+    return (folder / "session.json").is_file()
 
 
 def must_be_drafted(manifest: Path) -> bool:
@@ -245,7 +250,7 @@ def _listing(manifest: Path) -> str:
     """List the files beside a manifest with their sizes, without hidden ones and what `mocap` made."""
     home, files = manifest.parent, list[str]()
     for folder, inner, names in os.walk(home):
-        inner[:] = sorted(name for name in inner if name[0] != "." and not name.endswith(_MADE))
+        inner[:] = sorted(name for name in inner if name[0] != "." and not _is_made(Path(folder, name)))
         shown = [Path(folder, name) for name in sorted(names) if name[0] != "."]
         files += [f"{each.relative_to(home)} {each.lstat().st_size}" for each in shown if each != manifest]
     return "\n".join(files)
@@ -300,6 +305,9 @@ class _FileSearch:
         for path in paths:
             if not path.exists():
                 raise DataError(path, "does not exist", "check the path", code="no-such-file")
+            if _is_session(path):
+                remedy = "name the folder of the flight's files, or look at `mocap report SESSION`"
+                raise DataError(path, "is a session", remedy, code="wrong-kind")
             found = list(self._under(path))
             alone = not path.is_dir() or [thing for thing, _ in found] == [path]
             bases.append(path.parent if alone else path)
@@ -329,7 +337,7 @@ class _FileSearch:
         except OSError as error:
             self.left_out[folder] = f"cannot be read ({error.strerror}), left out"
             return
-        children = [c for c in every if c.name[0] != "." and c.suffix not in _MADE and c.exists()]
+        children = [c for c in every if c.name[0] != "." and not _is_made(c) and c.exists()]
         formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
         if formats:
             yield folder, formats

@@ -86,6 +86,9 @@ def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[s
     place = manifest.parent if manifest.exists() else folder
     found = draft([place], manifest, overwrite=True, ask=note_and_ask, progress=progress)
     progress.note(f"{manifest}: drafted, with {len(found.cameras)} cameras")
+    for path, reason in found.left_out.items():
+        if "; " in reason:  # it can be mended, unlike files of other kinds
+            progress.note(f"{path.name}: {reason}")
     if found.missing:
         problem = f"was drafted and lacks {'; '.join(map(one_line, found.missing))}"
         answered = all(any(f"{key}: " in remark for key in open_keys) for remark in found.missing)

@@ -81,7 +81,11 @@ class FlightFiles:
 
     def path(self, file: str) -> Path:
         """Return the path of a `file:`, the first one of a split log."""
-        return located(self._base, self._flight.paths_of(file)[0])
+        path = located(self._base, self._flight.paths_of(file)[0])
+        if self._flight.logs and file not in self._flight.logs and not path.exists():
+            remedy = f"check the path, or name one of the logs {', '.join(self._flight.logs)}"
+            raise DataError(path, "does not exist", remedy, code="no-such-file")
+        return path
 
     def format_of(self, part: str, source: FileSource) -> Format:
         """Recognise the file of a part of the manifest; errors as in `recognise`."""
