@@ -21,7 +21,7 @@ from benchmarks.results import fixed, markdown_table
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.body_model import body_model
 from pipelines.geometry.poses import cross_matrix, interpolate_poses
-from pipelines.geometry.rig import BONE, BONES
+from pipelines.geometry.rig import BONES, CENTRES
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.people import take_joints
@@ -41,17 +41,6 @@ CASES: dict[str, tuple[str, Poses, str]] = {
     "heavy network, true poses, `robust`": ("blazepose-heavy", "true", "robust"),
 }
 ONE_CAMERA = "one camera, default network, logged poses"
-CENTRES = {
-    f"{side}_{joint}": BONE[f"{side}_{bone}"]
-    for side in ("left", "right")
-    for joint, bone in (
-        ("hip", "thigh"),
-        ("shoulder", "upper_arm"),
-        ("elbow", "forearm"),
-        ("knee", "shank"),
-        ("ankle", "foot"),
-    )
-}
 _TIMES = 25  # at which surfaces are compared
 _VERTICES = 200
 

@@ -389,7 +389,7 @@ def _write_tables(
 ) -> None:
     observations, views, result = attempt.observations, attempt.views, attempt.result
     join_tables(folder / "skeleton.parquet", skeleton_parts(observations, result), SKELETON)
-    join_tables(folder / "angles.parquet", angles_parts(observations, views, result), ANGLES)
+    join_tables(folder / "angles.parquet", angles_parts(observations, views, result, bodies), ANGLES)
     write_table(folder / "gait.parquet", gait, GAIT)
     if any(body is not None for body in bodies):
         join_tables(folder / "body.parquet", body_parts(observations.t_ns, bodies), BODY)

@@ -48,6 +48,18 @@ PARENT: dict[str, str | None] = _TRUNK | {
 
 BONES = tuple(PARENT)
 BONE = {name: index for index, name in enumerate(BONES)}
+CENTRES = {
+    f"{side}_{joint}": BONE[f"{side}_{bone}"]
+    for side in SIDES
+    for joint, bone in (
+        ("hip", "thigh"),
+        ("shoulder", "upper_arm"),
+        ("elbow", "forearm"),
+        ("knee", "shank"),
+        ("ankle", "foot"),
+    )
+}
+"""Anatomical joints and the bones that begin there."""
 
 
 @dataclass(frozen=True)

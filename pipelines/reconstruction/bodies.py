@@ -12,7 +12,7 @@ from pipelines.geometry.arrays import Bool, Float, Index, Int64
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, body_model
 from pipelines.geometry.noise import UNKNOWN_SIGMA
 from pipelines.geometry.poses import interpolate_poses
-from pipelines.geometry.rig import BONE, BONES, SIDES
+from pipelines.geometry.rig import BONES, CENTRES
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.body_fit import BodyFit, Landmarks, Rays, fit_body, landmarks_of
 from pipelines.reconstruction.observations import Observations
@@ -33,10 +33,6 @@ TWO_RAYS_VARIANCE = 2.5 / 3
 _MIN_DETERMINANT = 0.02
 # A joint whose covariance is infinite has this variance per axis.
 _UNKNOWN_M2 = 1e4
-_JOINTS = [
-    BONE[f"{side}_{bone}"] for side in SIDES for bone in ("upper_arm", "forearm", "thigh", "shank", "foot")
-]
-"""Bones that begin at a shoulder, elbow, hip, knee or ankle."""
 # Surfaces are compared at this many times at most: a surface takes 3 ms.
 _COMPARED_TIMES = 100
 # Between true poses further apart nothing is interpolated.
@@ -311,7 +307,7 @@ def _surface_errors(t_ns: Int64, body: BodyFit, truth: MovingBody) -> dict[str, 
     ]
     centre, rotation = (np.stack([each[part] for each in true], axis=1) for part in range(2))
     whole, relative = [], []
-    away = body.centre[chosen][:, _JOINTS] - centre[:, _JOINTS]
+    away = (body.centre[chosen] - centre)[:, list(CENTRES.values())]
     centres = np.linalg.norm(away - (body.centre[chosen, :1] - centre[:, :1]), axis=-1)
     for k, row in enumerate(chosen.tolist()):
         if np.isfinite(centre[k]).all():

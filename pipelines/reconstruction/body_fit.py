@@ -39,8 +39,9 @@ _TABLE = Path(__file__).parent / "data" / "landmarks.csv"
 _TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 # With fewer joints, limbs would be of the prior alone.
 MIN_LANDMARKS = 10
-# A detector's errors have an autocorrelation of 0.1 after this time on the tuning flights.
-_INDEPENDENT_S = 0.4
+# A detector misplaces landmarks for as long as a posture lasts: with moments so far apart, errors of statures
+# are as large as stated on the tuning flights (2 s), and larger than stated with 0.4 s.
+_INDEPENDENT_S = 2.0
 # Correlation of the offsets of a face's, a hand's or a foot's landmarks on the tuning flights.
 _ALIKE_IN_A_GROUP = 0.85
 # More moments hardly make the shape surer, because offsets of landmarks stay.

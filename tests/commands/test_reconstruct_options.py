@@ -16,7 +16,9 @@ from scipy.stats import t
 
 from mocap_cli.main import Mocap
 from mocap_cli.reconstruct import reconstruct_command
-from pipelines.geometry.rig import BONES
+from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.geometry.joint_angles import ANGLES, joint_angles
+from pipelines.geometry.rig import BONES, CENTRES
 from pipelines.session.people import mirrored
 from pipelines.session.storage import read_json
 from tests.commands.runner import ingested, measured, mocap, result_of, succeeds
@@ -236,6 +238,13 @@ def test_a_simulated_person_gets_her_body(tmp_path: Path) -> None:
     knees = both[both["bone"].isin(["left_shank", "right_shank"])]
     away = knees[["x", "y", "z"]].to_numpy() - knees[["x_true", "y_true", "z_true"]].to_numpy()
     assert np.linalg.norm(away, axis=1).mean() < 0.05
+    # Adduction is that of the body's centres of joints, flexion of the knee that of landmarks.
+    place = np.stack([bodies[bodies["bone"] == BONES[k]][["x", "y", "z"]] for k in CENTRES.values()], axis=1)
+    own = joint_angles(tuple(CENTRES), place[:, None]).value_deg[:, 0]
+    stored = pd.read_parquet(session / "reconstruct" / "angles.parquet").pivot(index="t_ns", columns="angle")
+    there = stored["value_deg"].loc[bodies["t_ns"].unique()]
+    for name, same in (("left_hip_adduction", True), ("left_knee_flexion", False)):
+        assert np.allclose(there[name], own[:, list(ANGLES).index(name)], atol=1e-6, equal_nan=True) == same
 
     # The first drone by itself, and a stature that is stated.
     text = described.read_text()
@@ -254,9 +263,14 @@ def test_a_simulated_person_gets_her_body(tmp_path: Path) -> None:
     assert abs(metrics["body"]["person0"]["stature_m"] - 1.62) < 0.05
     succeeds("report", alone)
 
-    succeeds("export", session, "--to", "mesh", "-o", tmp_path / "out")
+    succeeds("export", session, "--to", "mesh,bvh", "-o", tmp_path / "out")
     (path,) = (tmp_path / "out").glob("*.glb")
     assert len(trimesh.load_scene(path).geometry) == 1
+    (path,) = (tmp_path / "out").glob("*.bvh")
+    rig = read_motion(path, unit="cm", axes="y-up")
+    pelvis = bodies[bodies["bone"] == "pelvis"][["x", "y", "z"]].to_numpy()
+    assert len(rig.bones) == len(BONES)
+    assert np.abs(rig.root - pelvis).max() < 1e-3
 
 
 # Two drones circle anna at 90 deg/s. Ben stands 3 m behind her and high in the pictures, which cross him

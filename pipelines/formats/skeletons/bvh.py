@@ -7,11 +7,14 @@ stand: `Zrotation Yrotation Xrotation` is Rz Ry Rx. Position channels replace th
 they are zero throughout. The file states neither unit nor axes. A y-up file's (x, y, z) becomes the world's
 (z, x, y).
 
-The export is a rig of bones with their median measured lengths. At rest the body stands in a T, facing +x
-with the left towards +y (in a y-up file +z and +x). Rotations follow in closed form. The left axis of the
-hips is the line between them, and their up axis is as near to the neck as that allows. The spine, at the same
-place, points to the neck, its left axis as near to the line between the shoulders as that allows. Every other
-bone points to its next joint by the smallest turn from its parent's direction: positions show no twist.
+The export is the rig of the person's body, at rest upright with hanging arms: its centres of joints were a
+third nearer to the true ones than landmarks on the tuning flights, and it shows how limbs twist. A person
+without a body, or whose body is known less often than the hips, gets bones of their median measured lengths.
+At rest that body stands in a T, facing +x with the left towards +y (in a y-up file +z and +x). Rotations
+follow in closed form. The left axis of the hips is the line between them, and their up axis is as near to the
+neck as that allows. The spine, at the same place, points to the neck, its left axis as near to the line
+between the shoulders as that allows. Every other bone points to its next joint by the smallest turn from its
+parent's direction: positions show no twist.
 
 BVH cannot mark missing values. Times before the first and after the last known hips are left out. In between,
 unknown hips keep their last position, and a bone with a missing end its last rotation. All of this is
@@ -29,17 +32,19 @@ import numpy as np
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import read_head
 from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints, describe_motion
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.poses import (
     conjugate,
+    interpolate_poses,
     matrix_from_quaternion,
     multiply,
     quaternion_from_matrix,
     rotate,
 )
+from pipelines.geometry.rig import BONE, BONES, PARENT
 from pipelines.session.errors import DataError
 from pipelines.session.people import take_joints, with_derived
-from pipelines.session.records import JointMotion, Recording, SkeletalMotion
+from pipelines.session.records import JointMotion, MovingBody, Recording, SkeletalMotion
 from pipelines.session.storage import bad_value, damaged, empty, read_text
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
@@ -54,6 +59,8 @@ _MOST_BONES = 5000
 _LARGEST = 1e9
 # A motion has several frames a minute, so a longer step is damage.
 _LONGEST_S = 3600
+# Between poses of a body that are further apart nothing is interpolated.
+_LONGEST_GAP_NS = 200_000_000
 _MOST_STRETCH_M = 0.05
 """Largest movement of a bone against its parent, either way, for which its mean position is used."""
 
@@ -358,10 +365,14 @@ class BvhExport:
         """Write every person to whom a rig can be fitted; a note gives the reason for each other one."""
         motion, files = people_of(recording, folder, ".bvh")
         even = at_even_times("bvh", motion, recording.progress)
+        bodies = {body.person: body for body in recording.bodies()}
         written, refused = [], None
         for person, path in files.items():
             try:
-                rigged = fit_rig(path.name, even.motion, person)
+                rigs = [fit_rig(path.name, even.motion, person)]
+                if person in bodies:
+                    rigs.insert(0, rig_of_body(bodies[person], even.motion.t_ns))
+                rigged = max(rigs, key=lambda rig: len(rig.motion.t_s) - rig.without_hips)
             except DataError as error:
                 refused = error
                 recording.progress.note(str(error))
@@ -528,6 +539,56 @@ def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
         rotation=rotation,
     )
     return Rigged(skeletal, tuple(bone.joint for bone in bones), int(seen[0]), int(without_hips.sum()), *held)
+
+
+_OF_BODY = {
+    "pelvis": "Hips",
+    "spine": "Spine",
+    "back": "Spine1",
+    "chest": "Spine2",
+    "neck": "Neck",
+    "head": "Head",
+    "clavicle": "Shoulder",
+    "upper_arm": "Arm",
+    "forearm": "ForeArm",
+    "hand": "Hand",
+    "thigh": "UpLeg",
+    "shank": "Leg",
+    "foot": "Foot",
+    "toes": "ToeBase",
+}
+
+
+def rig_of_body(body: MovingBody, t_ns: Int64) -> Rigged:
+    """Take a body, which is known at one time at least, as a rig at given times [T]."""
+    limits = {"max_gap_ns": _LONGEST_GAP_NS, "max_extrapolation_ns": 0}
+    moved = [
+        interpolate_poses(body.t_ns, body.centre[:, bone], body.rotation[:, bone], t_ns, **limits)
+        for bone in range(len(BONES))
+    ]
+    (seen,) = np.nonzero(np.isfinite(moved[0][0][:, 0]))
+    span = slice(int(seen[0]), int(seen[-1]) + 1)
+    centre, missing = _held(np.hstack([place[span] for place, _ in moved]))
+    world, _ = _held(np.hstack([turn[span] for _, turn in moved]))
+    centre, world = (values.reshape(len(values), len(BONES), -1) for values in (centre, world))
+    parent = tuple(-1 if above is None else BONE[above] for above in PARENT.values())
+    above = conjugate(world[:, parent])
+    above[:, 0] = [0.0, 0.0, 0.0, 1.0]
+    kinds = [name.removeprefix("left_").removeprefix("right_") for name in BONES]
+    skeletal = SkeletalMotion(
+        t_s=(t_ns[span] - t_ns[span][0]) / 1e9,
+        bones=tuple(
+            name.removesuffix(kind).rstrip("_").capitalize() + _OF_BODY[kind]
+            for name, kind in zip(BONES, kinds, strict=True)
+        ),
+        parent=parent,
+        offset=np.median(rotate(above, centre - centre[:, parent]), axis=0),
+        end={},
+        root=centre[:, 0],
+        rotation=multiply(above, world),
+    )
+    held = int(missing.sum())
+    return Rigged(skeletal, (), span.start, held, held * len(BONES), missing.size * len(BONES))
 
 
 def _rig_bones(place: dict[str, Float]) -> tuple[list[_RigBone], list[float]]:
