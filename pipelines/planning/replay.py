@@ -7,7 +7,6 @@ replays. No measurement or map is used before its time.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +17,6 @@ import pandas as pd
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Int64, Intrinsics
 from pipelines.geometry.cameras import project, undistort
-from pipelines.geometry.compilation import cached
 from pipelines.geometry.noise import NoiseModel, disturb, pose_errors, sum_sigma
 from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, rates, transform
 from pipelines.geometry.triangulation import Views, triangulate
@@ -45,19 +43,26 @@ class Start(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Replay:
-    """A replayed flight of N cameras at T times, one per tracking step."""
+class ArmFlight:
+    """Poses of the N cameras of an arm at the T times of the scene."""
+
+    names: tuple[str, ...]
+    position: Float  # [N, T, 3] m, world
+    quaternion_xyzw: Float  # [N, T, 4] world_from_camera
+    slots: Float  # [N, T, 3] commanded yaw (rad from east, continuous), tilt (rad), range (m); NaN: `flown`
+    aim: Float  # [N, T, P] shares of people in the place that each camera films
+    known: Bool  # [N, T] False where a log has a gap, or a battery is empty
+    safety: dict[str, int]  # local plannings by `guard.FlownMotion`; empty for logged arms
+
+
+@dataclass(frozen=True)
+class Replay(ArmFlight):
+    """A replayed flight, aimed at the estimate; its times are the tracking steps."""
 
     t_ns: Int64  # [T] on the clock of the actor's log
-    position: Float  # [N, T, 3] metres, world
     velocity: Float  # [N, T, 3] m/s
-    quaternion_xyzw: Float  # [N, T, 4] world_from_camera, aimed at the estimate
-    slots: Float  # [N, T, 3] commanded: yaw (rad from east, continuous), tilt (rad), range (m)
     actor: Float  # [T, 3] the log, interpolated; of several people the weighted middle
     estimate: Float  # [N, T, 3] the planner's estimate of whom each camera films
-    aim: Float  # [N, T, P] shares of people in the place that each camera films
-    known: Bool  # [N, T] False where a battery is empty
-    safety: dict[str, int]  # local plannings by `guard.FlownMotion`
 
     @property
     def t_s(self) -> Float:
@@ -221,6 +226,7 @@ def replay(
     *,
     config: PlannerConfig,
     weights: Sequence[float] = (1.0,),
+    names: Sequence[str] = (),
 ) -> Replay:
     """Fly an arm against a log.
 
@@ -275,6 +281,7 @@ def replay(
     position = blown(position, times_s, config)
     battery_kj = config.imperfections.battery_kj
     return Replay(
+        names=tuple(names),
         t_ns=replay_ns,
         position=position,
         velocity=velocity,
@@ -306,27 +313,15 @@ MIN_ACCELERATION_MPS2 = 0.1
 MIN_SMOOTHED_TIMES = 4
 # What all joints share is not farther off than this, even where no view tells it.
 FARTHEST_M = 100.0
-# This much information (1/m^2) keeps equations solvable where nothing was measured.
+# This much information (1/m^2), and share of the stiffness, keeps equations solvable without measurements.
 LEAST_INFORMATION = 1e-6
+LEAST_OF_STIFFNESS = 1e-10
 # Keypoints below this confidence are left out, as in `mocap reconstruct`.
 MIN_CONFIDENCE = 0.3
 
 _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 _SLOT = ["slot_yaw_rad", "slot_tilt_rad", "slot_range_m"]
-
-
-@dataclass(frozen=True)
-class ArmFlight:
-    """Poses of the N cameras of an arm at the T times of the scene."""
-
-    names: tuple[str, ...]
-    position: Float  # [N, T, 3] m, world
-    quaternion_xyzw: Float  # [N, T, 4] world_from_camera
-    slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for `flown`
-    aim: Float  # [N, T, P] shares of people in the place that each camera films
-    known: Bool  # [N, T] False where a log has a gap and the position goes straight on
-    safety: dict[str, int]  # local plannings by `guard.FlownMotion`; empty for logged arms
 
 
 def logged_arm(scene: ReplayScene, name: str) -> ArmFlight:
@@ -337,22 +332,17 @@ def logged_arm(scene: ReplayScene, name: str) -> ArmFlight:
     """
     if name == FLOWN:
         position, quaternion, known = scene.flown
-        names = tuple(camera.name for camera in scene.flight.cameras)
+        names = [camera.name for camera in scene.flight.cameras]
         slots = np.full_like(position, np.nan)
-        return ArmFlight(names, position, quaternion, slots, _on_the_middle(scene, known), known, {})
-    position, known = planned_positions(scene.flight, scene.t_ns)
-    estimates = _estimates(scene)
-    slots = slot_of(position - estimates)
-    slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
-    aim = _on_the_middle(scene, known)
-    return ArmFlight(
-        tuple(scene.flight.planned), position, look_at(position, estimates), slots, aim, known, {}
-    )
-
-
-def _on_the_middle(scene: ReplayScene, known: Bool) -> Float:
-    """Return the aim [N, T, P] of cameras that film the weighted middle."""
-    return np.broadcast_to(scene.weights, (*known.shape, len(scene.weights)))
+    else:
+        names = list(scene.flight.planned)
+        position, known = planned_positions(scene.flight, scene.t_ns)
+        estimates = _estimates(scene)
+        quaternion, slots = look_at(position, estimates), slot_of(position - estimates)
+        slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
+    # These cameras film the weighted middle.
+    aim = np.broadcast_to(scene.weights, (*known.shape, len(scene.weights)))
+    return ArmFlight(tuple(names), position, quaternion, slots, aim, known, {})
 
 
 def aimed_at(scene: ReplayScene, flown: ArmFlight) -> Float:
@@ -390,7 +380,7 @@ def _estimates(scene: ReplayScene) -> Float:
 
 def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
     """Fly a scene again with an arm's planner."""
-    done = replay(
+    return replay(
         arm,
         scene.flight.actor_t_ns,
         scene.flight.actor,
@@ -398,15 +388,7 @@ def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
         Start(scene.drones, scene.yaw_rad),
         config=scene.config,
         weights=scene.flight.weights,
-    )
-    return ArmFlight(
-        names=tuple(scene.names),
-        position=done.position,
-        quaternion_xyzw=done.quaternion_xyzw,
-        slots=done.slots,
-        aim=done.aim,
-        known=done.known,
-        safety=done.safety,
+        names=scene.names,
     )
 
 
@@ -643,45 +625,26 @@ def _across_ray(offset: Float) -> tuple[Float, Float]:
     return np.eye(3) - offset[..., :, None] * offset[..., None, :] / square[..., None, None], square
 
 
-@cached
 def smooth(series: Float, information: Float, stiffness: Float) -> None:
     """Smooth series [T, S, 3]: minimise sum (x - y)' W (x - y) + stiffness sum |second difference of x|^2.
 
-    The information W is [T, S, 3, 3], 0 where nothing was measured. The equations have a band of seven
-    diagonals below the main one, and are solved by Cholesky's method.
+    The information W is [T, S, 3, 3], 0 where nothing was measured.
     """
-    times, count = series.shape[:2]
-    rows = 3 * times
-    band, right = np.empty((rows, 7)), np.empty(rows)
-    for s in range(count):
-        for i in range(rows):
-            t, axis = i // 3, i % 3
-            inner = times - 2 - t  # of second differences, those that begin from here on
-            band[i] = 0.0
-            right[i] = 0.0
-            for b in range(3):
-                right[i] += information[t, s, axis, b] * series[t, s, b]
-                if b <= axis:
-                    band[i, 6 - axis + b] = information[t, s, axis, b]
-            begins, middle, ends = inner > 0, t > 0 and inner > -1, t > 1
-            band[i, 6] += stiffness[s] * (1.0 * begins + 4.0 * middle + 1.0 * ends) + LEAST_INFORMATION
-            band[i, 3] -= 2.0 * stiffness[s] * (1.0 * middle + 1.0 * ends)
-            band[i, 0] += stiffness[s] * ends
-            for k in range(max(0, 6 - i), 7):
-                j = i - 6 + k
-                left = band[i, k]
-                for m in range(max(0, j - 6, i - 6), j):
-                    left -= band[i, m - i + 6] * band[j, m - j + 6]
-                band[i, k] = left / band[j, 6] if j < i else math.sqrt(max(left, LEAST_INFORMATION))
-        for i in range(rows):
-            for j in range(max(0, i - 6), i):
-                right[i] -= band[i, j - i + 6] * right[j]
-            right[i] /= band[i, 6]
-        for i in range(rows - 1, -1, -1):
-            for j in range(i + 1, min(i + 7, rows)):
-                right[i] -= band[j, i - j + 6] * right[j]
-            right[i] /= band[i, 6]
-            series[i // 3, s, i % 3] = right[i]
+    from scipy.linalg import solveh_banded
+
+    bend = np.zeros((3, len(series), 1))  # squares of second differences by lag, 0 to 2, and the later time
+    bend[0, :-2] += 1.0
+    bend[0, 1:-1] += 4.0
+    bend[:, 2:] += np.array([1.0, -2.0, 1.0])[:, None, None]
+    bend[1, 1:-1] -= 2.0
+    for s, stiff in enumerate(stiffness):
+        band = np.zeros((7, len(series), 3))
+        for a, b in zip(*np.tril_indices(3), strict=True):
+            band[6 - a + b, :, a] = information[:, s, a, b]
+        band[[6, 3, 0]] += stiff * bend
+        band[6] += LEAST_INFORMATION + LEAST_OF_STIFFNESS * stiff
+        right = np.einsum("tab,tb->ta", information[:, s], series[:, s])
+        series[:, s] = solveh_banded(band.reshape(7, -1), right.ravel()).reshape(-1, 3)
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:

@@ -42,6 +42,7 @@ UNMEASURED: Colour = (209, 205, 201)
 GREY = 96
 _DARK: Colour = (0, 0, 0)
 _PAPER: Colour = (255, 255, 255)
+_FILLED = -1  # cv2.FILLED
 
 # A bone is 2 px wide in a picture of 1280 x 720, and other marks follow it.
 BONE_OF_DIAGONAL = 1 / 700
@@ -117,7 +118,7 @@ def draw_frame(
     reprojected, found, others = (
         (points + 0.5) * scale - 0.5 for points in (view.reprojected, view.found, view.others)
     )
-    _dots(drawn, others.reshape(-1, 2), bone, UNMEASURED)
+    _circles(drawn, others.reshape(-1, 2), bone, _FILLED, UNMEASURED)
     if view.spread is not None:
         _ellipses(drawn, view.joints, reprojected, view.spread * np.outer(scale, scale), max(1, bone // 2))
     _bones(drawn, view.joints, reprojected, bone)
@@ -125,8 +126,8 @@ def draw_frame(
         for start, end in zip(joint, keypoint, strict=False):
             _line(drawn, start, end, max(1, bone // 2), FOUND)
     for k, joint in enumerate(view.joints):
-        _dots(drawn, reprojected[:, k], 1.5 * bone, SIDES[side_of(joint)])
-    _rings(drawn, found[~view.rejected & ~view.unmeasured], 2.5 * bone, max(1, round(0.7 * bone)), FOUND)
+        _circles(drawn, reprojected[:, k], 1.5 * bone, _FILLED, SIDES[side_of(joint)])
+    _circles(drawn, found[~view.rejected & ~view.unmeasured], 2.5 * bone, max(1, round(0.7 * bone)), FOUND)
     _crosses(drawn, found[view.rejected], 2.5 * bone, bone, REJECTED)
     _crosses(drawn, found[view.unmeasured], 2.5 * bone, bone, UNMEASURED)
     _label(drawn, view.joints, reprojected, labels)
@@ -179,19 +180,12 @@ def _line(picture: Picture, start: Float, end: Float, thickness: int, colour: Co
         cv2.line(picture, _fixed(start), _fixed(end), colour, thickness, cv2.LINE_AA, COORDINATE_BITS)
 
 
-def _dots(picture: Picture, points: Float, radius: float, colour: Colour) -> None:
+def _circles(picture: Picture, points: Float, radius: float, thickness: int, colour: Colour) -> None:
     import cv2
 
+    wide = round(radius * 2**COORDINATE_BITS)
     for point in points[_drawable(points)]:
-        cv2.circle(
-            picture,
-            _fixed(point),
-            round(radius * 2**COORDINATE_BITS),
-            colour,
-            cv2.FILLED,
-            cv2.LINE_AA,
-            COORDINATE_BITS,
-        )
+        cv2.circle(picture, _fixed(point), wide, colour, thickness, cv2.LINE_AA, COORDINATE_BITS)
 
 
 def _ellipses(
@@ -215,21 +209,6 @@ def _ellipses(
                 cv2.ellipse(
                     picture, centre, size, angle, 0, 360, colour, thickness, cv2.LINE_AA, COORDINATE_BITS
                 )
-
-
-def _rings(picture: Picture, points: Float, radius: float, thickness: int, colour: Colour) -> None:
-    import cv2
-
-    for point in points[_drawable(points)]:
-        cv2.circle(
-            picture,
-            _fixed(point),
-            round(radius * 2**COORDINATE_BITS),
-            colour,
-            thickness,
-            cv2.LINE_AA,
-            COORDINATE_BITS,
-        )
 
 
 def _crosses(picture: Picture, points: Float, arm: float, thickness: int, colour: Colour) -> None:
