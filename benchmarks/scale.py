@@ -38,6 +38,8 @@ COMMANDS = (
     ("report",),
     ("export", "--to", "trc,csv,tum", "--overwrite"),
 )
+# A browser opens pages of this size at once, and a laptop beside other programs has this memory.
+MAX_PAGE_MB, MAX_REPORT_MB = 25.0, 700.0
 # A process of its own: a child's peak memory begins with that of the process that starts it.
 _MEASURED = """
 import json, resource, subprocess, sys
@@ -67,7 +69,12 @@ def commands(minutes: float) -> Iterator[list[str]]:
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
         session = ingest(flown(300, 60 * minutes, Path(folder)), Path(folder) / "long.session").folder
         for command, *options in COMMANDS:
-            yield [f"{minutes:g}", command, *map(fixed, cost_of(command, str(session), *options))]
+            peak_mb, took_s = cost_of(command, str(session), *options)
+            yield [f"{minutes:g}", command, fixed(peak_mb), fixed(took_s)]
+            if command == "report":
+                page_mb = (session / "report" / "index.html").stat().st_size / 1e6
+                if peak_mb > MAX_REPORT_MB or page_mb > MAX_PAGE_MB:
+                    raise SystemExit(f"a page of {page_mb:.1f} MB took {peak_mb:.0f} MB of memory")
 
 
 def cost_of(command: str, *options: str) -> tuple[float, float]:

@@ -88,7 +88,7 @@ def drafted(folder: Path, *, ask: Ask, progress: Progress) -> tuple[Path, list[s
     progress.note(f"{manifest}: drafted, with {len(found.cameras)} cameras")
     for path, reason in found.left_out.items():
         if "; " in reason:  # it can be mended, unlike files of other kinds
-            progress.note(f"{path.name}: {reason}")
+            progress.note(f"{path}: {reason}")
     if found.missing:
         problem = f"was drafted and lacks {'; '.join(map(one_line, found.missing))}"
         answered = all(any(f"{key}: " in remark for key in open_keys) for remark in found.missing)
