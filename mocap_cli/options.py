@@ -179,13 +179,9 @@ class Shown:
         return -1 if self.quiet else int(self.verbose)
 
 
-def _shown(as_json: bool, quiet: bool | None) -> Shown:
-    return Shown(as_json, quiet is True, quiet is False)
-
-
 output_options = grouped(
     "shown",
-    _shown,
+    lambda as_json, quiet: Shown(as_json, quiet is True, quiet is False),
     json_option,
     click.option(
         "-q/-v",

@@ -90,15 +90,11 @@ def estimates(rows: Sequence[Row], axis: str) -> list[dict[str, Any]]:
         made.append(
             {
                 **dict(zip(_CONDITION, condition, strict=True)),
-                "metrics": {name: _mean(own, name) for name in own[0] if _is_measured(name)},
+                "metrics": {name: _mean(own, name) for name in own[0] if name not in {*_CONDITION, "trial"}},
                 "ratio": _ratio(own, others),
             }
         )
     return made
-
-
-def _is_measured(name: str) -> bool:
-    return name not in {*_CONDITION, "trial"}
 
 
 def _mean(rows: Sequence[Row], name: str) -> dict[str, Any] | None:

@@ -143,7 +143,8 @@ def summarise(content: SessionContent) -> Summary:
     motion = motion_from_skeleton(content.skeleton) if content.skeleton is not None and has_rows else None
     truth = truth_at(content.truth, motion) if motion is not None and content.truth is not None else None
     error = errors_mm(motion, truth) if motion is not None and truth is not None else None
-    counts = _status_counts(motion) if motion is not None else {}
+    found = np.bincount(motion.status[motion.status >= 0]) if motion is not None else ()
+    counts = {word: int(n) for word, n in zip(STATUS, found, strict=False) if n}
     metrics = content.metrics or {}
     if content.every > 1:  # rows were left out, but were counted
         stated = section(metrics, "status_counts")
@@ -174,11 +175,6 @@ def truth_at(truth: pd.DataFrame, motion: MeasuredMotion) -> Float:
     """
     known = motion_from(truth, motion.joints)
     return own_truth(motion.measured_position, true_joints_at(known, motion.t_ns))
-
-
-def _status_counts(motion: MeasuredMotion) -> dict[str, int]:
-    counted = np.bincount(motion.status[motion.status >= 0], minlength=len(STATUS))
-    return {word: int(n) for word, n in zip(STATUS, counted, strict=True) if n}
 
 
 def _camera_row(name: str, entry: CameraEntry, origin_ns: int) -> CameraRow:
@@ -402,12 +398,8 @@ def _stated_noise(camera: CameraRow, poses: pd.DataFrame | None) -> str:
         position_m, rotation_rad = (
             float(np.sqrt(np.median(variances[:, k : k + 3].mean(axis=1)))) for k in (0, 3)
         )
-        return f"by the log: {_position_and_rotation(position_m, float(np.degrees(rotation_rad)))}"
+        return f"by the log: {fixed(position_m, 3)}{THIN}m, {fixed(np.degrees(rotation_rad), 2)}{THIN}deg"
     return "stands still" if camera.entry.poses.static else "nothing"
-
-
-def _position_and_rotation(position_m: float, rotation_deg: float) -> str:
-    return f"{fixed(position_m, 3)}{THIN}m, {fixed(rotation_deg, 2)}{THIN}deg"
 
 
 def _detection(content: SessionContent, camera: CameraRow) -> tuple[float | None, float | None]:
