@@ -100,9 +100,11 @@ def _parse_csv(
     types |= {str(index): pa.float64() for index in numbers.values()}
     if not body.strip():
         return pa.table({name: pa.array([], type=kind) for name, kind in types.items()})
+    names = [str(index) for index in range(columns)]
     return pyarrow.csv.read_csv(
         pa.BufferReader(body.encode()),
-        read_options=pyarrow.csv.ReadOptions(column_names=[str(i) for i in range(columns)]),
+        # Arrow's threads may still start when a quick command ends, and then abort it.
+        read_options=pyarrow.csv.ReadOptions(column_names=names, use_threads=False),
         parse_options=pyarrow.csv.ParseOptions(delimiter=delimiter),
         convert_options=pyarrow.csv.ConvertOptions(column_types=types, include_columns=list(types)),
     )

@@ -377,6 +377,8 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         raise damaged(path, f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s")
     keys = np.array([pts for pts, key in sure if key], np.int64)
     given = _given(path, ticks, _key_frames(ticks, keys))
+    if not given.any():
+        raise _undecodable(path, len(ticks))
     counts = {
         "cut off": len(lost) + len(stamped) - len(sure),
         "no stamp": len(whole) - len(stamped),
