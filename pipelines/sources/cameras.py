@@ -32,8 +32,8 @@ MAX_SHARE_BEYOND = 0.2
 MAX_SHARE_OUTSIDE = 0.5
 
 
-TriggerTimes = Callable[[FrameTimes], Int64 | None]
-"""Reader of the trigger times of pictures in a drone's own log, at world times; None if it is none."""
+TriggerTimes = Callable[[CameraSources], Int64 | None]
+"""Reader of the trigger times of a camera's pictures in a drone's own log, at world times; None without."""
 
 
 class FlightCameras:
@@ -86,7 +86,7 @@ class FlightCameras:
             stamped = self._logs.frames(times.file, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
         if times.file:
-            triggered = self._triggers(times)
+            triggered = self._triggers(camera)
             if triggered is not None:
                 return self._frames_by_stamps(triggered, {}, pictures)
             return self._frames_of_file(self._files.path(times.file), pictures)

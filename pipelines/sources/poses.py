@@ -549,12 +549,18 @@ class FlightPoses:
         """Return the fit of a drone's log clock to GPS time; None without one."""
         return self._read(camera.pose).fit if self._is_joined(camera.pose) else None
 
-    def triggers(self, times: FrameTimes) -> Int64 | None:
-        """Read the trigger times of pictures from a drone's own log, at world times; None if it is none."""
+    def triggers(self, camera: CameraSources) -> Int64 | None:
+        """Read the trigger times of pictures from a drone's own log, at world times; None if it is none.
+
+        Of a log that holds the camera's poses, too, they are of the same vehicle and clock.
+        """
+        times, choice = camera.frame_times or FrameTimes(), TelemetryChoice()
         stated, reader = times.file, self._files.format_of("frame_times", times)
         if not isinstance(reader, TriggerFormat):
             return None
-        t_ns = reader.picture_times(self._one_file(stated), TelemetryChoice())
+        if camera.pose.file == stated:
+            choice = self._files.options("pose", camera.pose, TelemetryChoice)
+        t_ns = reader.picture_times(self._one_file(stated), choice)
         return self._world_times(stated, t_ns, int(t_ns[0]))
 
     def _one_file(self, stated: str) -> Path:

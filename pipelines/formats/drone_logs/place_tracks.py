@@ -166,9 +166,11 @@ class AirsimRecording(DroneLog):
         body = attitude_track(name, t_ns, turned, dropped)
         return Telemetry(position, body, None, "the simulator's clock", dropped=dropped)
 
-    def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:  # noqa: ARG002  # alike for all
-        """Read the times at which all vehicles were filmed, ns [N]."""
-        return np.unique(_airsim_rows(path)[1])
+    def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
+        """Read the times at which a vehicle was filmed, of all if none is chosen, ns [N]."""
+        names, t_ns, *_ = _airsim_rows(path)
+        chosen = dict(enumerate(dict.fromkeys(names))).get(-1 if choice.instance is None else choice.instance)
+        return np.unique(t_ns[[chosen in (None, name) for name in names]])
 
 
 def _airsim_rows(path: Path) -> tuple[list[str], Int64, Float, dict[str, int]]:

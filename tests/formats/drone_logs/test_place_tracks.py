@@ -90,7 +90,8 @@ def test_airsims_recording_is_turned_to_east_north_up(tmp_path: Path) -> None:
     rows = ["VehicleName TimeStamp POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile"]
     for k in range(2):
         pose = f"{1_700_000_000_000 + 40 * k} {1 + k} 2.0 -34 {half} 0 0 {half}"
-        rows += [f"Drone1 {pose} a.png", f"Drone2 {pose.replace(' 2.0 ', ' 7 ')} b.png"]
+        later = pose.replace(" 2.0 ", " 7 ").replace("0 ", "5 ", 1)
+        rows += [f"Drone1 {pose} a.png", f"Drone2 {later} b.png"]
     path.write_text("\n".join(rows).replace(" ", "\t") + "\n", encoding="utf-8")
     assert recognise(path, TelemetryFormat, "log") is AIRSIM
     with pytest.raises(DataError, match="Drone1, Drone2"):
@@ -101,4 +102,5 @@ def test_airsims_recording_is_turned_to_east_north_up(tmp_path: Path) -> None:
         assert found.body is not None
         ahead, up = (rotate(found.body.quaternion_xyzw[0], axis) for axis in (np.eye(3)[0], np.eye(3)[2]))
         np.testing.assert_allclose([ahead, up], [[1, 0, 0], [0, 0, 1]], atol=1e-9)
-    assert np.diff(AIRSIM.picture_times(path, TelemetryChoice())).tolist() == [40_000_000]
+        times = AIRSIM.picture_times(path, TelemetryChoice(instance=instance)) - 1_700_000_000_000_000_000
+        assert times.tolist() == [5_000_000 * instance, 5_000_000 * instance + 40_000_000]
