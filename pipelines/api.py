@@ -65,11 +65,7 @@ def skeleton(session: Path) -> pd.DataFrame:
 
 
 def angles(session: Path) -> pd.DataFrame:
-    """Read the joint angles of a session in degrees, a row for each person, angle and time.
-
-    Raises:
-        DataError: it is no session, was not reconstructed, or the table was changed.
-    """
+    """Read the joint angles of a session in degrees, a row for each person, angle and time."""
     return _reconstructed(session, "angles", ANGLES)
 
 

@@ -52,11 +52,7 @@ def check(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Checked:
-    """Check a session, or a flight by its manifest; the result does not depend on `workers`.
-
-    `pose_noise` replaces that of flight.yaml; `detector` looks at pictures without keypoints. DataError: the
-    flight cannot be read, or nobody is seen.
-    """
+    """Check a session, or a flight by its manifest; `detector` looks at pictures without keypoints."""
     progress = progress or Silent()
     return_freed_arrays()
     with tempfile.TemporaryDirectory(prefix="mocap-check-") as folder:

@@ -480,11 +480,7 @@ def load_flight(
     workers: int,
     executor: Executor | None,
 ) -> LoadedFlight:
-    """Load cameras, logged people, backgrounds, ground and truth of a session.
-
-    `left_out` is the reason why no backgrounds were followed. DataError as of `load_cameras`, or a damaged
-    table.
-    """
+    """Load cameras, logged people, backgrounds (or why `left_out`), ground and truth of a session."""
     measured = measured_for(detected.settings["detector"]) if detected else None
     cameras, warnings = load_cameras(
         folder,
@@ -855,11 +851,7 @@ def find_people(
     people: int | None = 1,
     scene: Surroundings | None = None,
 ) -> tuple[Candidates, Association, Float]:
-    """Collect all detections at common times, and associate them with people; those logged come first.
-
-    With a scene, things that are no people by the ground and by the other cameras are left out. The last
-    result is the uncertainty of rays, see `ray_sigma`.
-    """
+    """Collect all detections at common times, associate them with people, logged first; see `ray_sigma`."""
     found = candidates(cameras, between)
     sigma = ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=PIXEL_SIGMA_PX)
     time_s = (found.t_ns - found.t_ns[0]) / 1e9

@@ -153,11 +153,7 @@ class _Page:
 def compare_sessions(
     folders: Sequence[Path], output: Path | None = None, *, overwrite: bool = False
 ) -> Reported:
-    """Write the page that compares every session with the first, by default comparison/index.html beside it.
-
-    DataError: not a session, damaged, changed by hand, stated twice, or the file exists and is no page of
-    mocap.
-    """
+    """Write the page that compares every session with the first, by default comparison/index.html."""
     resolved = [folder.resolve() for folder in folders]
     for folder, place in zip(folders, resolved, strict=True):
         if resolved.count(place) > 1:

@@ -124,11 +124,7 @@ class Studied:
 
 
 def values_of(words: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Parse `VARIABLE=VALUES` words: values between commas, or START:STOP:STEP with both ends.
-
-    Noise models, which hold commas, are separated by semicolons. DataError: a word has another form, a
-    variable is stated twice, or a range is empty.
-    """
+    """Parse `VARIABLE=VALUES` words: values between commas (noise models: semicolons), or START:STOP:STEP."""
     stated: dict[str, tuple[str, ...]] = {}
     for word in words:
         name, _, text = word.partition("=")

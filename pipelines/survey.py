@@ -30,11 +30,7 @@ class Survey:
 
 
 def survey(path: Path) -> list[Survey]:
-    """Describe a result of mocap, a file that users write for it, or a file of any registered format.
-
-    There is one description for each format that recognises the file. DataError: the path is missing,
-    damaged, or of no known kind.
-    """
+    """Describe a result, a file written for mocap, or one of a registered format, once for each of these."""
     if not path.exists():
         raise DataError(path, "does not exist", "check the path", code="no-such-file")
     refuse_special(path)

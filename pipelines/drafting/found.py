@@ -453,11 +453,7 @@ def choose_stamps(recordings: Sequence[FoundLog]) -> list[FoundLog]:
 
 
 def chains(edges: Sequence[FoundLink]) -> list[tuple[str, str, int]]:
-    """List (parent, child) of every moving camera or body frame of a log's transforms; cameras first.
-
-    The third is the time (ns) from which all transforms between them are known. The parent is the tree's
-    root.
-    """
+    """List (parent, child) of every moving frame below the tree's root, and from when (ns) it is known."""
     above: dict[str, FoundLink] = {}
     for edge in edges:
         above.setdefault(edge.child, edge)

@@ -132,12 +132,7 @@ class BodyModel:
         return np.asarray(joint[HINGE], np.float64)
 
     def moving_bones(self, centre: Float, rotation: Float) -> tuple[Float, Float]:
-        """Return world_from_rest quaternions [..., M, 4] and joints [..., M, 3] m of the moving bones.
-
-        Args:
-            centre: [..., 22, 3] m, joints of the bones.
-            rotation: [..., 22, 4] relative to the neutral pose.
-        """
+        """Return world_from_rest quaternions [..., M, 4] and joints [..., M, 3] m of the moving bones."""
         return with_bones_between(multiply(rotation, self.neutral_from_rest)), centre[..., HINGE, :]
 
     def surface(self, shape: Float, root: Float, rotation: Float) -> Float:
@@ -309,12 +304,7 @@ class Skinning:
     offset: Float  # [22, 3] m, of the rig
 
     def transforms(self, root: Float, rotation: Float) -> tuple[Float, Float]:
-        """Compute world from rest of all moving bones: rotations [..., M, 3, 3], translations [..., M, 3] m.
-
-        Args:
-            root: [..., 3] m, the pelvis's joint in the world.
-            rotation: [..., 22, 4] world_from_bone relative to the neutral pose, unit quaternions xyzw.
-        """
+        """Compute world from rest of moving bones (turns [..., M, 3, 3], shifts m) for a pelvis at `root`."""
         turned = multiply(rotation, self.neutral_from_rest)
         matrix = matrix_from_quaternion(with_bones_between(turned))
 

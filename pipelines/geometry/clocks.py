@@ -247,12 +247,7 @@ def find_gaps(stamps_ns: Int64) -> list[StampGap]:
 
 
 def time_passed(t_ns: Int64, values: Float, gap: StampGap, at: int) -> bool | None:
-    """Test by motion if the time of a gap passed; False if its clock stepped, None if motion does not tell.
-
-    `values` [N, D] are positions in m, or quaternions of continuous sign; `at` is the row of the first
-    message after the gap. The mean velocities before and after say how far the body moves in the usual
-    interval, and in the whole gap.
-    """
+    """Test by motion if the time of a gap before row `at` passed; False: its clock stepped; or None."""
     t_s = (t_ns - t_ns[at]) / 1e9
     count = max(_MIN_MESSAGES, int(_VELOCITY_S / max(gap.usual_s, 1e-3)))
     sides = slice(max(at - count, 0), at), slice(at, at + count)

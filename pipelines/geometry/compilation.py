@@ -47,11 +47,7 @@ def helper(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 
 
 def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Compile at the first call, release the interpreter while running, keep the code for the next process.
-
-    Where numba's cache cannot be written or read, the function is compiled for this process only, and an
-    unreadable cache is emptied for the next one.
-    """
+    """Compile at the first call (in this process only where numba's cache fails); release the interpreter."""
     options = {"nogil": True, **_OPTIONS}
     try:
         compiled = _with_cache(function, options)

@@ -46,11 +46,7 @@ class GaitEvents:
 
 
 def gait_events(joints: Sequence[str], t_ns: Int64, position: Float) -> GaitEvents | None:
-    """Find heel strikes and toe-offs while a person walks; None if they walk for less than two steps.
-
-    `position` [T, J, 3] m, z up, at strictly increasing `t_ns` [T]; nothing is found in runs of frames
-    shorter than a second in which hips, feet and toes are all known.
-    """
+    """Find heel strikes and toe-offs of `position` [T, J, 3] m, z up; None for less than two steps."""
     needed = ("left_hip", "right_hip", "left_ankle", "right_ankle")
     if len(t_ns) < 2 or not set(needed).issubset(joints):
         return None

@@ -24,11 +24,7 @@ _STRAIGHT_DEG = {"down": 90.0, "up": -90.0}
 
 
 def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
-    """Compute the rotation [4] of a camera that looks in a direction of the body, tilted down by an angle.
-
-    The top of its picture is up; straight down it is forward, straight up it is backward. ValueError: a tilt
-    beyond 90 degrees, or one on top of down or up.
-    """
+    """Compute the rotation [4] of a camera that looks in a direction, tilted down; ValueError: beyond 90."""
     if looks in _STRAIGHT_DEG and down_deg != 0:
         raise ValueError(
             f"looks {looks} and is tilted by {down_deg:g} deg: say where it looks before the tilt"

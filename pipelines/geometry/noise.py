@@ -266,11 +266,7 @@ class Process:
         return self.rate == 0 and not np.isfinite(self.correlation_s)
 
     def stray(self, elapsed_s: float) -> float:
-        """Compute the mean variance about the straight line between two values `elapsed_s` apart.
-
-        That of a Brownian bridge; a Gauss-Markov process is a walk of rate sigma sqrt(2 / correlation time)
-        then.
-        """
+        """Compute the mean variance about the line between values `elapsed_s` apart, of a Brownian bridge."""
         rate2 = self.rate**2
         if np.isfinite(self.correlation_s):
             rate2 += 2 * self.sigma0**2 / self.correlation_s

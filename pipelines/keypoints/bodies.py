@@ -98,11 +98,7 @@ class Bodies(NamedTuple):
 def find_bodies(
     time_s: Float, views: SightLines, logs: Float | None = None, before: Bodies | None = None
 ) -> Bodies:
-    """Find the bodies of all detections at increasing times [T].
-
-    `logs` [T, A, 4] m are the places of logged people and their standard deviation on each axis, NaN where
-    unknown; `before` the bodies of the same detections as they were found with other errors of the poses.
-    """
+    """Find the bodies of all detections at increasing times [T], with `logs` [T, A, 4] (m, deviation)."""
     # From left to right in each picture, so that the order of the input does not matter.
     given = np.where((views.confidence > 0)[..., None], views.xy, np.nan)
     x, y = np.moveaxis(known_median(given, axis=3), -1, 0)

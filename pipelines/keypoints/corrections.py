@@ -97,11 +97,7 @@ def undo_swaps(
 
 
 def undo_swaps_of_tracks(found: Detections, frame_t_ns: Int64) -> tuple[Detections, dict[str, int]]:
-    """Undo exchanges for all people that one camera followed; detections with one number are one person.
-
-    Detections are sorted by frame, `frame_t_ns` [F] are the times of these. Returned are the detections, and
-    the pictures with an exchange by limb, summed over the people.
-    """
+    """Undo exchanges for all whom one camera followed; return detections, and pictures by exchanged limb."""
     xy, confidence = found.xy.copy(), found.confidence.copy()
     total: Counter[str] = Counter()
     for person in np.unique(found.person):
@@ -150,11 +146,7 @@ def exchange(values: Float, where: Bool, pairs: Sequence[Pair]) -> None:
 
 
 def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: float) -> Bool:
-    """Find the pictures [T] in which pairs of joints, all together, are more likely exchanged than not.
-
-    `pairs` are columns of left and right joints of `xy` [T, J, 2], `size` that of the body in the unit of
-    `xy`.
-    """
+    """Find the pictures [T] in which pairs of joints, all together, are more likely exchanged than not."""
     left, right = (xy[:, [pair[side] for pair in pairs]] for side in (0, 1))
     seen = (np.isfinite(left) & np.isfinite(right)).all(-1).sum(-1)
     # In a picture with few of the joints the others would jump unseen: nothing predicts them in the next one.

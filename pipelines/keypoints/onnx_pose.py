@@ -331,11 +331,7 @@ def _line_peaks(scores: Float) -> tuple[Float, Float]:
 
 
 def heatmap_peaks(maps: Float) -> tuple[Float, Float]:
-    """Find joints [N, K, 2] in cells and the largest values [N, K] of maps [N, K, h, w].
-
-    One Newton step from the best cell, at most one cell in each direction; none at the border, where the
-    derivatives are not known, or where the map bends upwards.
-    """
+    """Find joints [N, K, 2] in cells, by one Newton step from the largest values [N, K] of maps."""
     people, joints, rows, columns = maps.shape
     flat = maps.reshape(people * joints, rows, columns)
     index = flat.reshape(len(flat), -1).argmax(axis=1)

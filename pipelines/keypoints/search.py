@@ -205,11 +205,7 @@ def squares_about(
 
 
 def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile]) -> list[FoundPerson]:
-    """Find people in parts of a picture [H, W, 3] BGR, each person once.
-
-    Whole bodies come before those that a tile's border cuts, then by score; of several at one place (in
-    overlapping tiles) the first is taken.
-    """
+    """Find people in parts of a picture [H, W, 3] BGR, each once: whole bodies first, then by score."""
     found = [
         FoundPerson(_moved(region, part), score, _is_cut(region, part, picture))
         for part in parts
@@ -223,11 +219,7 @@ def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile])
 
 
 def same_place(a: Region, b: Region) -> bool:
-    """Test if two regions are around one person.
-
-    The test uses centres and not overlap: regions are much wider than people, so the regions of two people
-    side by side overlap by more than half.
-    """
+    """Test by their centres if two regions, which are much wider than people, are around one person."""
     return math.dist(a.centre, b.centre) < _SAME_PERSON_SHARE * max(a.side, b.side)
 
 

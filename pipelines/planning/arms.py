@@ -312,11 +312,7 @@ Path = tuple[int, Int64]
 
 
 def plan_in_turn(choices: Sequence[Sequence[SlotChoice]], worth: Worth) -> list[Path]:
-    """Plan a team, one drone after the other, until nobody finds a better path.
-
-    Each path is the cheapest of all choices of its drone (dynamic programming): its price and turning, less
-    what its views add to the worth of those of the others.
-    """
+    """Plan a team, one drone's cheapest path after the other, until nobody finds a better one."""
     taken: dict[int, Path] = {}
     for _ in range(MAX_ROUNDS_IN_TURN):
         changed = False

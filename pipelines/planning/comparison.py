@@ -135,11 +135,7 @@ class ArmResult:
 
 
 def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
-    """Score every arm and the differences to the reference.
-
-    Errors are compared on common joint-frames: those that all arms measured in a trial, for `mpjpe_mm` and
-    for the differences alike. `coverage` is the share that the arm itself measured.
-    """
+    """Score every arm and the differences to the reference, on joint-frames that all arms measured."""
     measured = {name: each.measured for name, each in results.items() if each.measured is not None}
     shared = common_frames({name: each.error_m for name, each in measured.items()}) if measured else None
     seen = {name: seen_people(scene, result.flight) for name, result in results.items()}

@@ -228,11 +228,7 @@ _ADAPTER = TypeAdapter(PlannerConfig)
 
 
 def planner_config(values: Mapping[str, object], source: Path | str = "planner settings") -> PlannerConfig:
-    """Read settings from a mapping, as from YAML; keys that are missing keep their defaults.
-
-    `imperfections.KEY` is one of the `Imperfections`. DataError: unknown keys, values of another type, or out
-    of range; every problem in one message.
-    """
+    """Read settings from a mapping, as from YAML; DataError: everything unknown, or of a wrong value."""
     problems = []
     dotted = [key for key in values if str(key).startswith(_DOTTED)]
     if dotted:

@@ -20,83 +20,48 @@ class Forecast(NamedTuple):
 
 
 class ActorFilter:
-    """Position and velocity of the actor from the measurements so far, and nothing later.
+    """Position and velocity of people from the measurements so far; as one actor they are their middle.
 
     x = [p, v] per axis, F = [[1, dt], [0, 1]], Q = q [[dt^3/3, dt^2/2], [dt^2/2, dt]] (white noise
-    acceleration of spectral density q, m^2/s^3); one 2x2 covariance serves all axes.
+    acceleration of spectral density q, m^2/s^3); one 2x2 covariance serves all axes of a person.
     """
 
-    def __init__(self, *, q: float, sigma_m: float) -> None:
-        self._q = q
-        self._variance = sigma_m**2
-        self._t_s: float | None = None
-        self._state = np.zeros((2, 3))
-        self._covariance = np.diag([self._variance, FIRST_SPEED_SIGMA_MPS**2])
+    def __init__(self, *, q: float, sigma_m: float, weight: Sequence[float] | Float = (1.0,)) -> None:
+        self._q, self._variance = q, sigma_m**2
+        self._weight: Float = np.asarray(weight, np.float64) / np.sum(weight)
+        people = len(self._weight)
+        self._t_s = np.full(people, np.nan)  # of the last measurement
+        self._state = np.zeros((people, 2, 3))
+        self._covariance = np.tile(np.diag([self._variance, FIRST_SPEED_SIGMA_MPS**2]), (people, 1, 1))
 
-    def measure(self, t_s: float, position: Float) -> None:
-        """Update with one measured position [3], metres, world, not earlier than the last one.
-
-        ValueError: the time goes backwards, or the position is not finite.
-        """
-        if not np.isfinite(position).all():
-            raise ValueError("a measured position must be finite: leave out what was not measured")
-        if self._t_s is None:
-            self._state[0] = position
-            self._t_s = t_s
+    def measure(self, t_s: float, position: Float, person: int = 0) -> None:
+        """Update with a measured position [3] of a person, m, world, not earlier than the last one."""
+        state, dt = self._state[person], t_s - self._t_s[person]
+        self._t_s[person] = t_s
+        if np.isnan(dt):
+            state[0] = position
             return
-        state, P = self._predicted(t_s)
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        Q = self._q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        P = np.einsum("ij,jk,lk->il", F, self._covariance[person], F) + Q
         gain = P[:, 0] / (P[0, 0] + self._variance)
-        self._state = state + gain[:, None] * (position - state[0])
+        state[0] += dt * state[1]
+        state += gain[:, None] * (position - state[0])
         # Joseph's form: stays positive definite whatever the rounding.
         keep = np.array([[1.0 - gain[0], 0.0], [-gain[1], 1.0]])
         kept = np.einsum("ij,jk,lk->il", keep, P, keep)
-        self._covariance = kept + self._variance * gain[:, None] * gain
-        self._t_s = t_s
-
-    def forecast(self, t_s: Float) -> Float:
-        """Forecast positions [T, 3] at times [T], none of them before the last measurement."""
-        if self._t_s is None:
-            raise ValueError("nothing was measured yet")
-        ahead = t_s - self._t_s
-        if ahead.size and ahead.min() < 0:
-            raise ValueError("a forecast looks ahead of the last measurement")
-        where: Float = self._state[0] + ahead[:, None] * self._state[1]
-        return where
+        self._covariance[person] = kept + self._variance * gain[:, None] * gain
 
     def each(self, t_s: Float) -> Float:
-        """Forecast everybody whom the filter follows, [1, T, 3]; see `PeopleFilter`."""
-        return self.forecast(t_s)[None]
-
-    def _predicted(self, t_s: float) -> tuple[Float, Float]:
-        if self._t_s is None:
-            raise ValueError("nothing was measured yet")
-        dt = t_s - self._t_s
-        if dt < 0:
-            raise ValueError(f"time goes back by {-dt:g} s")
-        F = np.array([[1.0, dt], [0.0, 1.0]])
-        Q = self._q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        state = np.stack([self._state[0] + dt * self._state[1], self._state[1]])
-        return state, np.einsum("ij,jk,lk->il", F, self._covariance, F) + Q
-
-
-class PeopleFilter:
-    """Estimates of several people, a filter for each; as one actor they are their middle by `weight` [P]."""
-
-    def __init__(self, filters: Sequence[ActorFilter], weight: Float) -> None:
-        self._filters, self._weight = tuple(filters), weight / weight.sum()
-
-    def measure(self, t_s: float, position: Float, person: int = 0) -> None:
-        """Update with a measured position [3] of a person; see `ActorFilter.measure`."""
-        self._filters[person].measure(t_s, position)
+        """Forecast everybody, [P, T, 3], at times [T] after the last measurements."""
+        ahead = t_s - self._t_s[:, None]
+        where: Float = self._state[:, None, 0] + ahead[..., None] * self._state[:, None, 1]
+        return where
 
     def middle(self, people: Float) -> Float:
         """Return the weighted middle [T, 3] of people [P, T, 3]."""
         middle: Float = self._weight @ people.reshape(len(people), -1)
         return middle.reshape(people.shape[1:])
-
-    def each(self, t_s: Float) -> Float:
-        """Forecast every person, [P, T, 3]."""
-        return np.array([each.forecast(t_s) for each in self._filters])
 
 
 def positions_at(t_ns: Int64, people: Float, at_ns: Int64) -> Float:

@@ -467,11 +467,7 @@ def _turn_the_shorter_way(slots: Float) -> None:
 def cheapest_slots(
     grid: Grid, sight: Sight, actor: Float, formations: Formations, w: SlotWeights, commanded: Float
 ) -> Float:
-    """Plan a formation in one call, from the slots [n, 3] that are commanded now: look, weigh, search.
-
-    `actor` is its forecast [T, 3]. Return slots [T + 1, n, 3] at the knots, the first as commanded; yaw is
-    continuous.
-    """
+    """Plan a formation from the slots [n, 3] commanded now: [T + 1, n, 3] at the knots, yaw continuous."""
     shape = (actor.shape[0], formations.slots.shape[0], formations.slots.shape[1])
     obstacle, share = np.zeros(shape), np.zeros(shape)
     reached = _reached(formations.lattice, commanded[0], shape[0])

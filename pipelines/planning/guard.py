@@ -21,7 +21,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, Grid, interpolate
-from pipelines.planning.forecast import ActorFilter, PeopleFilter
+from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.local import POSITION, VELOCITY, DronePlan, flying_of, roll_out, stopping_ticks
 
 # At 8 m/s a drone flies 0.4 m between two checks; every half voxel is checked as well.
@@ -79,11 +79,7 @@ class _Motion:
 
 
 class Guard:
-    """The drones of one replayed flight; flies only the safe ones of the planner's wishes.
-
-    Args:
-        position: [N, 3] m, the drones at rest.
-    """
+    """The drones of one replayed flight, first at rest; flies only the safe ones of the planner's wishes."""
 
     def __init__(self, position: Float, config: PlannerConfig) -> None:
         self._config, self._flying = config, flying_of(config)
@@ -118,7 +114,7 @@ class Guard:
         return [states[age:] for states, age in zip(self._states, self._age, strict=True)]
 
     def admit(
-        self, drone: int, t_s: float, plan: DronePlan, actor: ActorFilter | PeopleFilter, field: DistanceField
+        self, drone: int, t_s: float, plan: DronePlan, actor: ActorFilter, field: DistanceField
     ) -> DronePlan:
         """Commit a drone to the best safe motion for the local `plan`; return the plan that is flown."""
         after_s = self._flying.period_s * np.arange(self._states.shape[1], dtype=np.float64)

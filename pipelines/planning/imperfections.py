@@ -29,11 +29,7 @@ def outages(t_s: Float, imperfections: Imperfections) -> Bool:
 
 
 def blown(position: Float, t_s: Float, config: PlannerConfig) -> Float:
-    """Add the way to which gusts push drones at [N, T, 3] m off their tracks.
-
-    Drones lean against the constant wind. Gusts are Gauss-Markov processes; position, velocity and integral
-    of the error are fed back as in tracking (`local`), without its limits.
-    """
+    """Add the way to which Gauss-Markov gusts push drones at [N, T, 3] m off their tracks, as they track."""
     gust_mps = config.imperfections.gust_mps
     if not gust_mps:
         return position

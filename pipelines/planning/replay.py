@@ -23,7 +23,7 @@ from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.planning.arms import Arm, RollingOut
 from pipelines.planning.config import MOST_DRONES, PlannerConfig
 from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, open_space, visible
-from pipelines.planning.forecast import ActorFilter, Forecast, PeopleFilter, positions_at
+from pipelines.planning.forecast import ActorFilter, Forecast, positions_at
 from pipelines.planning.formation import TILT, YAW, FormationPath, formation_slots, slot_of, slot_offsets
 from pipelines.planning.guard import FlownMotion, Guard
 from pipelines.planning.imperfections import aimed, blown, outages
@@ -82,11 +82,7 @@ class Replay(ArmFlight):
 
 
 class Pilot:
-    """One arm in flight. Call `measure` at each measurement and `replan` at the tracking rate.
-
-    The configuration's rates count from the first call. Drones plan one after the other, each with the latest
-    plans of the others. ValueError: an impossible number of drones.
-    """
+    """One arm in flight. Call `measure` at each measurement and `replan` at the tracking rate."""
 
     def __init__(
         self, arm: Arm, config: PlannerConfig, start: Start, *, weights: Sequence[float] = (1.0,)
@@ -100,8 +96,8 @@ class Pilot:
         self._local_planner = LocalPlanner(config)
         self._weight = np.array(weights, dtype=np.float64)
         self._by_weight = np.tile(self._weight / self._weight.sum(), (start.drones, 1))
-        people = [ActorFilter(q=config.actor_q, sigma_m=config.tuning.actor_sigma_m) for _ in weights]
-        self._filter = PeopleFilter(people, self._weight)
+        sigma_m = config.tuning.actor_sigma_m
+        self._filter = ActorFilter(q=config.actor_q, sigma_m=sigma_m, weight=weights)
         slots = formation_slots(
             np.array([start.yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
         )
@@ -325,11 +321,7 @@ _SLOT = ["slot_yaw_rad", "slot_tilt_rad", "slot_range_m"]
 
 
 def logged_arm(scene: ReplayScene, name: str) -> ArmFlight:
-    """Return the flight of one of `LOGGED`.
-
-    The drones of `planned` are exactly at their commanded positions. Each has its own camera. The camera
-    looks at the actor as the Kalman filter estimates it from the log, as in a replay.
-    """
+    """Return the flight of one of `LOGGED`; cameras of `planned` look at the estimate, as in a replay."""
     if name == FLOWN:
         position, quaternion, known = scene.flown
         names = [camera.name for camera in scene.flight.cameras]
@@ -364,9 +356,9 @@ def looks_rad(flown: ArmFlight) -> Float:
 
 def _estimates(scene: ReplayScene) -> Float:
     """Estimate the actor's positions [T, 3] as planners do, from no later measurement."""
-    flight, config = scene.flight, scene.config
-    each = [ActorFilter(q=config.actor_q, sigma_m=config.tuning.actor_sigma_m) for _ in scene.people]
-    actor, known = PeopleFilter(each, scene.weights), np.isfinite(flight.actor[..., 0])
+    flight, tuning = scene.flight, scene.config.tuning
+    actor = ActorFilter(q=scene.config.actor_q, sigma_m=tuning.actor_sigma_m, weight=scene.weights)
+    known = np.isfinite(flight.actor[..., 0])
     log_s = (flight.actor_t_ns - flight.actor_t_ns[0]) / 1e9
     until = np.searchsorted(flight.actor_t_ns, scene.t_ns, side="right")
     found, taken = np.empty((len(scene.t_ns), 3)), 0

@@ -121,11 +121,7 @@ class LoggedFlight:
 def load_flight(
     folder: Path, description: Description, reconstructed: StageRecord | None, *, pose_noise: str | None
 ) -> LoggedFlight:
-    """Read the flight, cut to the time in which the actor and all moving cameras are known.
-
-    `reconstructed` is the record of that stage, `pose_noise` replaces the session's. DataError: the actor is
-    unknown, or not known while the cameras flew; an unknown noise model.
-    """
+    """Read the flight while the actor and all moving cameras are known; DataError: they never are."""
     warnings: list[str] = []
     skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
     t_ns, actor, source = _actor(folder, description, reconstructed, warnings)

@@ -890,11 +890,7 @@ def refine_cameras(
     *,
     between: Interpolation,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    """Refine the poses of cameras by the backgrounds that were `followed`, or keep them for the reason there.
-
-    `errors` are those stated for each log, None for unknown ones. Return the cameras with the errors that
-    remain, the entry of each in metrics.json, and warnings.
-    """
+    """Refine cameras by the backgrounds `followed`: cameras, remaining errors, metrics and warnings."""
     refined: list[Camera] = []
     entries: dict[str, Any] = {}
     warnings: list[str] = []

@@ -196,12 +196,7 @@ class Follower:
         self._found: list[tuple[int, Int64, NDArray[np.float32]]] = []
 
     def step(self, row: int, picture: Bytes | None) -> None:
-        """Follow the points into the next picture.
-
-        Args:
-            row: number of the picture in the tracks.
-            picture: grey [H, W]; None if it cannot be decoded. No point is followed across it.
-        """
+        """Follow the points into the next grey picture [H, W] of number `row`; across None nothing is."""
         if picture is None or self._before is None:
             self._points, self._number = self._points[:0], self._number[:0]
         elif len(self._points):

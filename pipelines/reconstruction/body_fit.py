@@ -146,11 +146,7 @@ class BodyFit:
 
 @dataclass(frozen=True)
 class Shared:
-    """Unknowns that all moments share, G = 12 + 3 K + 1.
-
-    They are the shape, offsets [K, 3] from the table, and the height of the ground over where it is thought
-    to be, which one camera alone needs (`one_camera`).
-    """
+    """Unknowns of all moments, G = 12 + 3 K + 1: shape, offsets [K, 3], the ground's height (one camera)."""
 
     shape: Float
     offset: Float

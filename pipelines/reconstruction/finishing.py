@@ -100,11 +100,7 @@ class Butterworth:
 
 
 def smoother(text: str | None) -> Butterworth | None:
-    """Parse a text like `butterworth:cutoff_hz=6,order=4` to a filter; None stays None.
-
-    Raises:
-        DataError: the text has another form, or an unknown filter or option.
-    """
+    """Parse a text like `butterworth:cutoff_hz=6,order=4` to a filter; None stays None."""
     if text is None:
         return None
     remedy = "write butterworth:cutoff_hz=6,order=4"

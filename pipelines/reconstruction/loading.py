@@ -250,11 +250,7 @@ class PoseDisturbance:
 
     @classmethod
     def parse(cls, text: str) -> PoseDisturbance:
-        """Parse `MODELS [xTRIALS] [seed=SEED]`; without them there is one trial, and the seed is 0.
-
-        Raises:
-            DataError: it cannot be parsed, all sizes are 0, or there are no trials or too many.
-        """
+        """Parse `MODELS [xTRIALS] [seed=SEED]`; without them there is one trial, and the seed is 0."""
         place = "--disturb-poses"
         found = _DRAWS.fullmatch(text)
         words = {} if found is None else found.groupdict()

@@ -66,12 +66,7 @@ class Camera:
         return middles[np.arange(4), [0, 1, 0, 1]]
 
     def seen(self) -> tuple[Float, Float]:
-        """Compute the keypoints of its frames.
-
-        Returns:
-            Undistorted normalised image coordinates [F, D, J, 2], NaN where nothing was found, and their
-            confidences [F, D, J], 0 there.
-        """
+        """Compute its keypoints: rays [F, D, J, 2], NaN where nothing was found; confidences [F, D, J]."""
         found = self.detections
         rays = np.full((len(self.frame_t_ns), self.most_people, len(found.joints), 2), np.nan)
         confidence = np.zeros(rays.shape[:-1])

@@ -731,11 +731,7 @@ def _bridge_sigma(at_ns: Int64, quaternion_xyzw: Float) -> float:
 
 
 def poses_of_pictures(laid: LaidMap, t_ns: Int64, places: Float, at_ns: Int64) -> tuple[Float, Float]:
-    """Return the camera's places [T, 3] and attitudes [T, 4] at the times of its pictures; NaN without.
-
-    Attitudes are a spline through those of key pictures. Places are the log's; between its rows they move as
-    the map does.
-    """
+    """Return places [T, 3] (as logged, and as mapped in between) and attitudes [T, 4] of pictures; or NaN."""
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
 

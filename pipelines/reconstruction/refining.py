@@ -237,11 +237,7 @@ def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
 
 
 def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, reference: str) -> FoundClocks:
-    """Find which stated clocks the rays of people contradict, among `questioned` [C].
-
-    `held` [C] are stated or found, with those that are questioned; of two clocks that explain the same, that
-    of the camera `reference` is right.
-    """
+    """Find which `questioned` [C] of the `held` [C] clocks rays contradict; `reference` is right."""
     none = np.zeros(len(held))
     offset_s, names = none.copy(), [camera.name for camera in flight.cameras]
     if held.sum() > 1:
@@ -503,12 +499,7 @@ class FlightWindow:
 
 
 def windows_of(t_s: Float, keypoints: int) -> list[FlightWindow]:
-    """Divide the skeleton's times [T] into windows of equal length; a short flight is one.
-
-    Args:
-        t_s: the times.
-        keypoints: at one time, of all joints in all cameras.
-    """
+    """Divide the times [T] of so many keypoints into windows of equal length; a short flight is one."""
     lasts_s = float(t_s[-1] - t_s[0])
     by_memory = min(len(t_s) * keypoints / MAX_KEYPOINTS, lasts_s / MIN_WINDOW_S)
     count = int(np.ceil(max(lasts_s / MAX_WINDOW_S, by_memory, 1.0)))
@@ -568,11 +559,7 @@ def refine_in_windows(
     workers: int = 1,
     executor: Executor | None = None,
 ) -> Refined:
-    """Run `refine`, whose arguments these are, on some of the windows of `windows_of`, and join the results.
-
-    Joints outside the windows, and in a window that was refused, are NaN. The clocks are medians of the
-    windows. The result is refused if all windows are.
-    """
+    """Run `refine` on some windows, and join the results: medians of clocks, NaN joints where none is."""
     levels = None if prior is None else list(prior)
     whole = _Order(t_s, tuple(sightings), start, bones, levels, clock_sigma_s, measured)
     if len(windows) == 1 and windows[0].stop - windows[0].first == len(t_s):

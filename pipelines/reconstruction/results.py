@@ -118,11 +118,7 @@ def assess(
 def of_people(
     names: Sequence[str], observations: Observations, result: Triangulation, truth: Float | None
 ) -> dict[str, Any]:
-    """Compute the figures `by_person`, and with truth who was missed and confused; `tracking` else None.
-
-    The `coverage` is the share of the times with any measured joint, the `reconstructed_share` one of
-    joint-frames.
-    """
+    """Compute the figures `by_person`, and with truth who was missed and confused; `tracking` else None."""
     shape = observations.confidence.shape[:3]
     ok = result.status.reshape(shape) == _OK
     position = np.where(ok[..., None], result.points.reshape(*shape, 3), np.nan)
@@ -286,11 +282,7 @@ _NO_BODY = {
 
 
 def people_warnings(people: Mapping[str, Any]) -> list[str]:
-    """Write warnings on bodies that are nobody, unused detections, and more people than requested.
-
-    Args:
-        people: the counts that metrics.json has of people.
-    """
+    """Warn of bodies that are nobody, unused detections, and more people than requested, by the counts."""
     warnings = []
     causes = ", ".join(f"{count} {_NO_BODY[cause]}" for cause, count in people["phantoms"].items())
     if causes:

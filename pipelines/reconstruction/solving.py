@@ -52,11 +52,7 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_
 
 
 def views_with_noise(cameras: Sequence[Camera], observations: Observations, *, pixel_sigma: float) -> Views:
-    """Build the views, one row for each joint-frame, with the noise that the gates need.
-
-    Residuals that the stated noise does not explain are added as pixel noise: with too little noise the
-    gates would reject good views.
-    """
+    """Build the views; residuals that the stated noise does not explain are added as pixel noise."""
     times, people, joints, count = observations.confidence.shape
     focal = np.array([camera.focal_px for camera in cameras])
     stated = observations.pose_sigma

@@ -670,11 +670,7 @@ def write_drawing(folder: Path, name: str, figure: Figure) -> list[str]:
 
 
 def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
-    """Refuse to write figures over what is not ours; with `overwrite` only over sessions and their parts.
-
-    DataError: a session, a part of one, or a folder that contains one; a file, or a folder that contains more
-    than figures that were written before.
-    """
+    """Refuse to write figures over sessions and, without `overwrite`, over anything that is not ours."""
     refuse_sessions(folder, mark=MARK, option="--figures")
     if overwrite or not folder.exists():
         return

@@ -109,11 +109,7 @@ def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:
 
 
 def as_reconstructed(content: SessionContent) -> SessionContent:
-    """Return the session with the poses and the clocks that its skeleton was measured with.
-
-    Refined poses replace the logged ones, and frames have the times of the estimated clocks. Only then are
-    residuals those of the reconstruction.
-    """
+    """Return the session with the refined poses and the clocks that its skeleton was measured with."""
     offset_ns = estimated_clocks(content.metrics or {})
     frames = {
         name: table.assign(t_ns=table["t_ns"] + offset_ns.get(name, 0))

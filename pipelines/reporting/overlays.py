@@ -147,11 +147,7 @@ def filmed_cameras(content: SessionContent) -> list[FilmedCamera]:
 def residuals_over_time(
     content: SessionContent, summary: Summary, most: int
 ) -> dict[str, tuple[Float, Float]]:
-    """Compute each camera's median distance between keypoints and joints, in at most so many of its frames.
-
-    Return for each camera with keypoints the times [N] in s and the medians [N] px, NaN where nothing can be
-    compared.
-    """
+    """Compute each camera's median distance of keypoints and joints: times [N] s and medians [N] px."""
     motion = summary.motion
     if motion is None or not motion.measured.any():
         return {}
@@ -269,11 +265,7 @@ class FilmedCamera:
 
 
 def status_at(motion: MeasuredMotion, t_ns: Int64) -> NDArray[np.int8]:
-    """Return every joint's status at the skeleton's time nearest to each of [N] times, [N, P, J].
-
-    -1, as where the table has no row, at times for which the skeleton is not interpolated: outside its own,
-    or in a gap.
-    """
+    """Return every joint's status nearest to each of [N] times, [N, P, J]; -1 where nothing is near."""
     held = np.clip(t_ns, motion.t_ns[0], motion.t_ns[-1])
     before = np.searchsorted(motion.t_ns, held, side="right") - 1
     after = np.minimum(before + 1, len(motion.t_ns) - 1)

@@ -144,11 +144,7 @@ def blank_frame(width: int, height: int, words: str) -> Picture:
 
 
 def caption_of(view: OverlayView, status: NDArray[np.int8], method: str) -> tuple[str, str]:
-    """Write the caption of a frame: camera, frame, time, and the number of joints by status.
-
-    Args:
-        status: [P, J] index into triangulation.STATUS, -1 where the skeleton has no row.
-    """
+    """Write the caption of a frame: camera, frame, time, and the number of joints by `status` [P, J]."""
     counts = np.bincount(status[status >= 0].ravel(), minlength=len(STATUS))
     words = [f"{count} {word}" for word, count in zip(STATUS, counts, strict=True) if count]
     if not words:

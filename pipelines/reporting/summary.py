@@ -168,11 +168,7 @@ def summarise(content: SessionContent) -> Summary:
 
 
 def truth_at(truth: pd.DataFrame, motion: MeasuredMotion) -> Float:
-    """Return the true positions at the motion's times and joints, [T, P, J, 3].
-
-    Each person is compared with the nearest true one, by `true_joints_at`; NaN also for joints and people
-    that are not in the truth.
-    """
+    """Return the true positions at the motion's times and joints, [T, P, J, 3], of the nearest person."""
     known = motion_from(truth, motion.joints)
     return own_truth(motion.measured_position, true_joints_at(known, motion.t_ns))
 

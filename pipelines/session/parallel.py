@@ -39,11 +39,7 @@ R = TypeVar("R")
 def each_part(
     work: Callable[[T], R], parts: Sequence[T], *, workers: int = 1, executor: Executor | None = None
 ) -> Generator[tuple[int, R]]:
-    """Call a function of a module with every part; yield number and result in the order in which they end.
-
-    Closed early, the parts that are not done are cancelled. One worker is this process; an `executor` works
-    instead. MocapError: the first that a part raised, or a worker could not run it.
-    """
+    """Call a function with every part; yield number and result as they end. One worker is this process."""
     workers = min(workers, len(parts))
     if executor is None and (workers < 2 or multiprocessing.current_process().daemon):
         yield from ((number, work(part)) for number, part in enumerate(parts))

@@ -233,10 +233,6 @@ def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
 
 
 def longest_step_ns(t_ns: Int64) -> int:
-    """Return the longest step between samples that is not a gap; 0 for fewer than two samples.
-
-    Two cameras of 25 Hz that are not synchronised give alternating steps of 8 and 32 ms, and neither is a
-    gap.
-    """
+    """Return the longest step between samples that is not a gap; 0 for fewer than two samples."""
     steps = np.diff(t_ns)
     return int(GAP_IN_USUAL_STEPS * np.percentile(steps, PERCENTILE_OF_USUAL_STEPS)) if len(steps) else 0

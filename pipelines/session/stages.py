@@ -424,11 +424,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 def open_session(folder: Path) -> Session:
-    """Open a session for reading; nothing is written into it.
-
-    DataError if it is none, is damaged, of a later version, or a stage was interrupted while it was
-    published.
-    """
+    """Open a session for reading; DataError: it is none, damaged, newer, or was interrupted."""
     try:
         for stage in STAGES:
             new, old = _new_folder(folder, stage), _old(folder, stage)

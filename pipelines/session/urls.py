@@ -48,11 +48,7 @@ T = TypeVar("T")
 
 
 def url_of(place: Path | str) -> str | None:
-    """Return the URL that a place is; None for a place on this machine, also for a path that exists.
-
-    A URL that has become a Path has lost one of its slashes. DataError if it holds a secret or is not
-    fetched.
-    """
+    """Return the URL that a place is; None for a path. DataError: it holds a secret or is not fetched."""
     text = str(place)
     found = _URL.fullmatch(text)
     if found is None or os.path.lexists(text):

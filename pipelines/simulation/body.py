@@ -372,11 +372,7 @@ _CLOTHES, _SLICE, _SOLE_STRIP = 0.008, 0.017, 0.017  # fractions of the height
 
 @dataclass(frozen=True)
 class PosablePerson:
-    """A person who can be posed.
-
-    `rig` is measured from this very mesh. Arms hang straight, leaning outward just enough to clear the
-    hips; the rest is the neutral pose of `rig`.
-    """
+    """A person who can be posed; arms hang straight, just clear of the hips. `rig` is of this very mesh."""
 
     rig: Rig
     joints: tuple[str, ...]  # of the keypoints: COCO-17
@@ -398,11 +394,7 @@ class PosablePerson:
         return multiply(motion.rotation, self.skinning.neutral_from_rest)
 
     def keypoints(self, motion: BodyMotion) -> Float:
-        """Compute the keypoints [T, 17, 3] m, world, in the order of `joints`.
-
-        A blend of transforms is linear in the points, so the mean of the skinned vertices of a keypoint
-        is the blend of their mass and moment by bone.
-        """
+        """Compute keypoints [T, 17, 3] m by blending their mass and moment by bone: blends are linear."""
         found = np.empty((len(motion.t_s), len(self.joints), 3))
         for part in (slice(k, k + _FRAMES_AT_ONCE) for k in range(0, len(motion.t_s), _FRAMES_AT_ONCE)):
             matrix, translation = self.skinning.transforms(motion.root[part], motion.rotation[part])
@@ -412,11 +404,7 @@ class PosablePerson:
 
 
 def make_body(look: Body) -> PosablePerson:
-    """Make the person of a scenario: `look.height_m` from bare soles to the crown in the neutral pose.
-
-    Shoes and hair come on top: 1 % and 1 % of the height. The ground, z = 0 of the neutral pose, is
-    under the shoes.
-    """
+    """Make a scenario's person, `look.height_m` tall without shoes and hair; the ground, z = 0, is below."""
     body = _undressed(look)
     dressed = dress(body, OUTFITS[look.outfit], hair_m=_HAIR_M[look.sex])
     skin = make_skin(dressed.vertices, dressed.weights)

@@ -171,11 +171,7 @@ def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
 def visible_joints(
     flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
 ) -> tuple[Float, Bool]:
-    """Project a person's joints into pictures: [F, J, 2] px, NaN outside, and [F, J] whether seen.
-
-    Pixels are exact. A rolling shutter takes each joint when it reads its row. Joints are hidden by the world
-    and by anybody else, not by the person's own body.
-    """
+    """Project a person's joints into pictures, row by row: [F, J, 2] px, NaN outside; [F, J] if seen."""
     truth, joints = drone.at_frames, person.joints[flight.moments_of(drone)]
     t_ns = truth.t_ns[:, None]
     place, turn = truth.camera_position[:, None], truth.camera_quaternion_xyzw[:, None]
@@ -232,11 +228,7 @@ def _during_readouts(flight: SimulatedFlight, drone: SimulatedDrone, person: Sim
 def keypoints_of(
     flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
 ) -> tuple[Float, Float]:
-    """Model the keypoints that a detector finds of a person in a drone's pictures, by measured errors.
-
-    Returns:
-        [F, J, 2] px, NaN for missed joints, and [F, J] confidences.
-    """
+    """Model a detector's keypoints [F, J, 2] px of a person, NaN for missed ones; confidences [F, J]."""
     scenario, truth = flight.scenario, drone.at_frames
     rows = flight.moments_of(drone)
     pixels, visible = visible_joints(flight, drone, person)

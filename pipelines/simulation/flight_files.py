@@ -68,11 +68,7 @@ def write_joints(
 
 
 def write_alphapose(path: Path, people: Iterable[TrackedKeypoints]) -> None:
-    """Write keypoints as AlphaPose does with its tracker: a list of people, picture by picture.
-
-    Frame k is picture `00000k.jpg`. Joints that were missed are 0, 0, 0; frames in which all of a person's
-    joints were missed have no entry. Within a picture people keep the given order.
-    """
+    """Write keypoints as AlphaPose does with its tracker; frame k is picture `00000k.jpg`, missed is 0."""
     entries = [
         (frame, _alphapose_entry(frame, person)) for person in people for frame in _frames_with(person)
     ]
@@ -184,11 +180,7 @@ _UNKNOWN_CLOCK_SIGMA_S = 0.3
 
 
 def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = False) -> str:
-    """Write the manifest, which ties the files together: videos, or keypoints in their place.
-
-    With `true_poses` the true poses are the logged ones. Otherwise it states only what a user would know; the
-    truth is only under `truth`.
-    """
+    """Write the manifest, which states what a user would know, with `true_poses` the true ones as logged."""
     scenario = flight.scenario
     lines = [
         "# Simulated by `mocap simulate` from scenario.yaml; simulation.json says how.",

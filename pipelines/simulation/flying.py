@@ -177,11 +177,7 @@ def fly_with(
     actor: Float,
     rate_hz: float,
 ) -> DronePaths:
-    """Fly after slots that a planner gives during the flight; the drones hover at `start` [N, 3] m at first.
-
-    The planner is called at the first of the moments `t_s` and then at the first one at or after every
-    further 1 / `rate_hz`. It knows the estimates [M, 3] m of the actor so far.
-    """
+    """Fly after slots that a planner gives at `rate_hz`; the drones hover at `start` [N, 3] m at first."""
     flight = _Flight.starting(start[:, None], np.zeros_like(start[:, None]), t_s, limits)
     ticks = np.floor((t_s - t_s[:1]) * rate_hz + 1e-9)
     calls = np.flatnonzero(np.diff(ticks, prepend=-1.0)).tolist()
@@ -372,11 +368,7 @@ class PoseLog:
 
 
 def log_times(rate_hz: float, span_s: tuple[float, float], rng: np.random.Generator) -> Int64:
-    """Draw the stamps [M] of a log within a span, ns since the flight's start, strictly increasing.
-
-    The recorder's ticks have a random phase against the flight's start. Every stamp has a small jitter about
-    its tick.
-    """
+    """Draw the stamps [M] of a log's ticks, of random phase and small jitter, ns since the flight's start."""
     first, last = span_s
     ticks = first + (np.arange(max(0, np.ceil((last - first) * rate_hz))) + rng.random()) / rate_hz
     jitter = np.clip(JITTER_SHARE * rng.standard_normal(len(ticks)), -_LARGEST_JITTER, _LARGEST_JITTER)
@@ -385,11 +377,7 @@ def log_times(rate_hz: float, span_s: tuple[float, float], rng: np.random.Genera
 
 
 def frame_times(lens: Lens, duration_s: float, rng: np.random.Generator) -> Int64:
-    """Draw the stamps [F] of the frames that one camera kept, ns since the flight's start.
-
-    The shutter starts at a random time within the first frame's period, or at the flight's start where
-    shutters are synchronised. Frames are lost one by one; the first and the last are kept.
-    """
+    """Draw the stamps [F] of the frames that a camera kept of its shutter, ns since the flight's start."""
     phase = rng.random() * (lens.shutters == "free")
     count = max(0, int(np.ceil(duration_s * lens.rate_hz - phase)))
     shutter_s = np.arange(count, dtype=np.float64) / lens.rate_hz + phase / lens.rate_hz
@@ -403,11 +391,7 @@ def frame_times(lens: Lens, duration_s: float, rng: np.random.Generator) -> Int6
 
 
 def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
-    """Interpolate the true poses of one drone at moments [M] (ns since the flight's start) of its path.
-
-    Positions follow the cubic through the path's positions and velocities, attitudes turn evenly. The
-    camera always sits at the lever arm's end.
-    """
+    """Interpolate a drone's true poses at moments [M]: cubic positions, even turns, the lever arm's end."""
     grid_ns = _nanoseconds(paths.t_s)
     position = _hermite(grid_ns, paths.position[drone], paths.velocity[drone], t_ns)
     longest_ns = int(np.diff(grid_ns).max(initial=0))

@@ -62,11 +62,7 @@ class Foot:
 def foot_over_time(
     rig: Rig, side: int, t_s: Float, steps: Sequence[Footstep], extra: Keys, ground: Heights
 ) -> Foot:
-    """Compute the place and the attitude of a foot over time [T]; side 0 is left.
-
-    The first of the steps only gives the foot's place at the beginning. `extra` are curves beside the steps:
-    `heel_deg`, by which both heels are raised, `left_kick`, `right_kick`.
-    """
+    """Compute place and attitude of a foot (0: left) over time [T], with the curves `extra` beside steps."""
     keys = _keys_of_steps(steps, leg_m=rig.length_of_leg)
     curve = {name: keys.at(name, t_s) for name in ("x", "y", "yaw", "clear", "soft", "bent", "carries")}
     joint, heel, tip = _sole(rig, side)
@@ -509,11 +505,7 @@ def crouch(plan: Plan, seconds: float, depth: float) -> None:
 
 
 def reach(plan: Plan, side: str, height_m: float, seconds: float, shoulder_m: float, arm_m: float) -> None:
-    """Move a hand (or both) up to a height above the ground, hold it there, and move it back.
-
-    Trunk and knees bend to reach heights below the waist. `shoulder_m` is the height of the shoulders of
-    the person standing, `arm_m` the length from shoulder to wrist.
-    """
+    """Move a hand (or both) up to a height, hold it, and move it back; low ones bend trunk and knees."""
     there = plan.t_s + _REACH_S
     back = there + seconds
     end = back + _REACH_S

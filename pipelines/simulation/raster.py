@@ -19,11 +19,7 @@ from pipelines.geometry.compilation import cached
 
 @dataclass(frozen=True)
 class TriangleSurface:
-    """Triangles with a colour at each corner, seen from both sides.
-
-    `smooth` surfaces are shaded with normals averaged at their corners, others face by face. Where
-    `ground` is True the colour is multiplied by the renderer's ground texture at (x, y).
-    """
+    """Triangles coloured by corner, shaded by face unless `smooth`; `ground` has the renderer's texture."""
 
     vertices: Float  # [V, 3] m, world
     faces: NDArray[np.int32]  # [F, 3], counterclockwise seen from outside
@@ -45,11 +41,7 @@ def joined(*surfaces: TriangleSurface) -> TriangleSurface:
 
 
 def hidden_by(surface: TriangleSurface, eye: Float, targets: Float) -> Bool:
-    """Test if a surface, whose both sides hide, stands between an eye [3] and targets [N, 3] m, world.
-
-    Exact up to rounding, which counts where a line runs through the edge of a triangle. False for a target
-    with NaN.
-    """
+    """Test if a surface stands between an eye [3] and targets [N, 3] m, world; False for NaN."""
     out = np.empty(len(targets), dtype=np.bool_)
     eye, targets = np.ascontiguousarray(eye, np.float64), np.ascontiguousarray(targets, np.float64)
     _meets(np.ascontiguousarray(surface.vertices, np.float64), surface.faces, eye, targets, out)
@@ -183,11 +175,7 @@ def projected(
 
 
 def bands(triangles: Projected, height: int, rows: int) -> tuple[Int32, NDArray[np.int64]]:
-    """Find the triangles that each band of `rows` pixel rows has to draw.
-
-    Returns:
-        [M] rows of `triangles`, band after band, and [B + 1] the start of each band.
-    """
+    """Find the triangles [M] of each band of `rows` pixel rows, and the start [B + 1] of each band."""
     return _sorted_into_bands(triangles.corners, height, rows)
 
 
@@ -494,11 +482,7 @@ def sun_axes(sun: Float) -> Float:
 
 
 def shadow_map(mesh: Mesh, region: Float, axes: Float, *, finest_m: float, most_texels: int) -> ShadowMap:
-    """Draw the map of a mesh over the part of the plane that some points [N, 3] m, one at least, cover.
-
-    Faces outside that region are left out. The side of a texel is `finest_m`, or larger if the map needs
-    more than `most_texels` along a side.
-    """
+    """Draw a mesh's map over points [N, 3] m in texels of `finest_m`, or larger ones if they are too many."""
     covered = np.einsum("ij,nj->ni", axes[:2], region)
     low, high = covered.min(axis=0), covered.max(axis=0)
     texel = max(finest_m, float((high - low).max()) / (most_texels - 2 * _MARGIN - 1))

@@ -51,11 +51,7 @@ def shade(
     view: CameraView,
     light: Float32,
 ) -> None:
-    """Write the light [R, W, 3] of a band's pixels from `first_row` on: the mean of that at their samples.
-
-    `sun` [N] is the cosine of the sun's incidence times the share of it that reaches a fragment, `sky` [R *
-    W] the share of each pixel's samples that see sky.
-    """
+    """Write the light [R, W, 3] of a band's pixels, from the fragments' `sun` [N] and the share of `sky`."""
     _fill_sky(sky, first_row, view.world_from_camera, view.pinhole, light)
     _add(
         fragments.pixel[:count],
@@ -470,11 +466,7 @@ class Renderer:
     def picture(
         self, position: Float, quaternion_xyzw: Float, people: Sequence[TriangleSurface], frame: int
     ) -> Bytes:
-        """Render the camera's picture [H, W, 3] BGR; equal arguments give equal bytes.
-
-        People are the surfaces that move. The pose is world_from_camera. The noise follows from seed,
-        position and `frame`.
-        """
+        """Render [H, W, 3] BGR with people's surfaces; noise follows from seed, position, `frame`."""
         return self.exposed(
             [ExposedMoment(position, quaternion_xyzw, people)], np.ones((1, self._size[0])), frame
         )

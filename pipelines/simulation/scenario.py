@@ -284,11 +284,7 @@ class Lens(YamlModel):
         return self
 
     def intrinsics(self) -> Intrinsics:
-        """Return the intrinsics of a camera that looks straight ahead.
-
-        The principal point is the middle of the picture. It is (width - 1) / 2, because pixel centres are
-        whole numbers. `hfov_deg` gives the focal length as without distortion.
-        """
+        """Return the intrinsics of a camera whose principal point is the middle, (width - 1) / 2."""
         focal = self.width / 2 / float(np.tan(np.radians(self.hfov_deg / 2)))
         return Intrinsics(
             self.width,
@@ -390,11 +386,7 @@ class Scenario(YamlModel):
 
 
 def read_scenario(path: Path) -> Scenario:
-    """Read and validate a scenario.
-
-    DataError: the file is missing, no YAML, or does not keep to the schema; the message holds every problem
-    that was found.
-    """
+    """Read and validate a scenario; DataError: every problem that was found."""
     scenario = read_yaml_model(
         path,
         Scenario,

@@ -196,11 +196,7 @@ def views_of(
     seed: int,
     trial: int,
 ) -> Views:
-    """Return the input of triangulation: keypoints, logged poses, sigmas; T * J rows, joints fastest.
-
-    The true standard deviation of the noise on the logged poses is the pose sigma; `trial` is the number of
-    the draw.
-    """
+    """Return the input of triangulation, T * J rows, joints fastest, with the noise's own sigma of poses."""
     cameras, times, joints = sightings.confidence.shape
     position, rotation = np.empty((times, cameras, 3)), np.empty((times, cameras, 3, 3))
     sigma = np.empty((times, cameras, 2))
@@ -246,11 +242,7 @@ def measure_arm(
     tilt_deg: Float,
     range_m: Float,
 ) -> dict[str, Any]:
-    """Measure an arm: figures by their names in film/metrics.json.
-
-    Shares are of pictures, or of joints in them. Points are [T, J, 3] m, NaN where there is none; tilts and
-    ranges [N, T] are the cameras' from the person.
-    """
+    """Measure an arm from its points [T, J, 3] m: figures by their names in film/metrics.json."""
     exact = exact_keypoints(of, seen_by).xy
     inside = np.isfinite(exact[..., 0])
     off_px = np.linalg.norm(sightings.xy - exact, axis=-1)

@@ -642,11 +642,7 @@ def _range(low_m: float, high_m: float, side: float, first: int, count: int) -> 
 
 
 def build_world(spec: scenario.WorldSettings, seed: int, *, keep_clear: Float) -> World:
-    """Raise the mounds, plant the wood, stand trees and walls on the ground.
-
-    `keep_clear` [K, 2] m are points of the actor's way, which the wood keeps clear of. Trees with a place in
-    the scenario stand at that place. DataError: the wood does not fit, or a wall has no length.
-    """
+    """Raise the mounds, plant the wood clear of points [K, 2] m, stand trees and walls on the ground."""
     terrain = raise_mounds(spec.mounds)
     trees = list(spec.trees)
     if spec.wood is not None:

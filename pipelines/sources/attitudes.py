@@ -82,12 +82,7 @@ class TurnedByPictures:
 
 @dataclass(frozen=True)
 class FilmOfCamera:
-    """Pictures from which the attitudes are found.
-
-    Attributes:
-        digest: SHA-256 of their files.
-        opened: opens them.
-    """
+    """Pictures from which the attitudes are found."""
 
     digest: str
     opened: Callable[[], AbstractContextManager[CameraPictures]]

@@ -56,11 +56,7 @@ def in_pixels(detections: Detections, intrinsics: Intrinsics, source: str) -> De
 
 
 def without_repeats(detections: Detections, frames: CameraFrames) -> tuple[Detections, list[str]]:
-    """Drop detections that a tracker holds while its person moves on; return also a note on each stretch.
-
-    A detection repeats if three or more joints, all it has, are where they were for the same person in
-    the picture before. Stretches of repeats up to 0.3 s stay.
-    """
+    """Drop detections of three joints or more that a tracker holds for over 0.3 s; note each stretch."""
     order = np.lexsort((detections.frame, detections.person))
     xy, person = detections.xy[order], detections.person[order]
     t_ns = frames.t_ns[np.searchsorted(frames.frame, detections.frame[order])]

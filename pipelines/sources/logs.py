@@ -322,11 +322,7 @@ DEFAULT_HEIGHT_M = 2.5
 def maps_of_log(
     flight: Manifest, stated: MapSource, logs: FlightLogs, *, max_gap_ns: int, note: Callable[[str], None]
 ) -> LoggedMaps:
-    """Read the maps of a topic, in ENU axes at world times.
-
-    DataError: no such topic, several, no readable map, or a map in a frame that nothing connects with the
-    world.
-    """
+    """Read the maps of a topic, in ENU axes at world times; DataError: none can be read or placed."""
     log, options = stated.file, LoggedMap.model_validate(stated.options)
     with logs.open(log) as opened:
         recording, source, settings = opened.recording, opened.source, opened.settings

@@ -108,11 +108,7 @@ class Origin:
 
 
 class FlightPoses:
-    """Reader of the poses of one flight, in the world's axes and at its times.
-
-    Gaps of more than `max_gap_ns` between two poses or angles are not interpolated. `note` receives each
-    choice and each doubt, one line each.
-    """
+    """Reader of the poses of one flight in the world's axes, at its times; `note` receives each choice."""
 
     def __init__(
         self,

@@ -201,7 +201,7 @@ def test_a_steady_walk_is_forecast_exactly() -> None:
     actor = ActorFilter(q=1e-9, sigma_m=1e-6)
     for t in np.arange(0, 2, 0.1):
         actor.measure(t, np.array([1.2 * t, 3.0 - 0.5 * t, 1.0]))
-    ahead = actor.forecast(np.array([2.0, 12.0]))
+    ahead = actor.each(np.array([2.0, 12.0]))[0]
     assert ahead == pytest.approx(np.array([[2.4, 2.0, 1.0], [14.4, -3.0, 1.0]]), abs=1e-3)
 
 

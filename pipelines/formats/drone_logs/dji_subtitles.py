@@ -118,11 +118,7 @@ def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
 def choose_height(
     path: Path, columns: Mapping[str, Float], choice: TelemetryChoice
 ) -> tuple[Float, Height, str]:
-    """Choose the height of each position; return it with its reference and a note about the choice.
-
-    `columns` [N] m are `relative` to the take-off, `absolute`, and `altitude` without a reference, which is
-    used for each of the two that has no column of its own; NaN where there is none.
-    """
+    """Choose the height of each position from columns [N] m; return its reference and a note, too."""
     stated, unnamed = choice.altitude, columns["altitude"]
     if isinstance(stated, int | float):
         throughout = np.full(len(columns["latitude"]), float(stated))
@@ -230,11 +226,7 @@ class Subtitles:
         return (stated / 10 if stated > MAX_FOCAL_35_MM else stated) or None
 
     def times(self) -> tuple[Int64, Bool]:
-        """Return the time at which each subtitle was written [B], and True if that is known [B].
-
-        Slow subtitles show whole seconds, so the video's own time is added to the clock time of its start.
-        Without any clock it is the video's own time.
-        """
+        """Return when each subtitle was written [B] (else the video's own time), and if that is known [B]."""
         start_ns = self.start_ns()
         if start_ns is None:
             return self.media_ns, np.ones(len(self.media_ns), dtype=np.bool_)

@@ -351,11 +351,7 @@ def describe_fit(fit: ClockFit) -> str:
 
 
 def between_repeats(t_ns: Int64, values: Float) -> tuple[Float, int]:
-    """Interpolate the positions [N, D] of a log that repeats each measurement until the next one comes.
-
-    If a value stays the same for longer than a second before it changes, the hold is kept until one second
-    before the change. Also return the number of changed rows.
-    """
+    """Interpolate positions [N, D] that a log repeats, the last second of each hold; count changed rows."""
     smooth = np.stack([_between_changes(t_ns, column, len(t_ns)) for column in values.T], axis=1)
     return smooth, int(np.count_nonzero((smooth != values).any(axis=1)))
 

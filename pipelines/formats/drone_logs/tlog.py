@@ -120,11 +120,7 @@ class TlogFormat(DroneLog):
         return replace(found, clock="the ground station's clock", fit=None) if station else found
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
-        """Read the times of pictures, ns [N], increasing: CAMERA_FEEDBACK, else CAMERA_TRIGGER.
-
-        Stamps since boot become UTC or the station's clock. Pictures are assigned in order, so none may be
-        lost.
-        """
+        """Read the times of pictures, ns [N], increasing: CAMERA_FEEDBACK, else CAMERA_TRIGGER."""
         log = _read(path)
         system = _vehicle(path, log, choice.instance, _PICTURES)
         kind = _CAMERA_FEEDBACK if (system, _CAMERA_FEEDBACK) in log.payloads else _CAMERA_TRIGGER

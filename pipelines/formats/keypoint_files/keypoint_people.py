@@ -56,11 +56,7 @@ def json_files(folder: Path) -> list[Path]:
 
 
 def samples(path: Path) -> list[object]:
-    """Read the beginning of a JSON file, or of a few files across a folder, to recognise the format.
-
-    Lists are cut to their first entry that is not empty, at the top, or the first one level below. Unreadable
-    files are skipped.
-    """
+    """Read the beginning of a JSON file, or of a few files across a folder, to recognise the format."""
     if path.is_dir():
         files = json_files(path)
         if len(files) < _LEAST_SHARE * sum(not each.name.startswith(".") for each in path.iterdir()):

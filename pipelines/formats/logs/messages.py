@@ -47,11 +47,7 @@ _SIGNATURES = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png"}
 
 
 def kind_of(topic: Topic) -> Kind | None:
-    """Return the kind of a topic's messages by the name of their type; None for types that are not read.
-
-    "poses" are those of one body, "transforms" those of any number of frames. Arrays of poses at one moment
-    do not name the body of each and are left out, and so are maps (see `maps`).
-    """
+    """Return the kind of a topic's messages by their type ("poses" of one body); None if it is not read."""
     known = _READERS.get(topic.type)
     return known[0] if known else None
 

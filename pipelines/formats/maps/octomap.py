@@ -89,11 +89,7 @@ class OctomapFormat(MapFile):
 def occupancy_from(
     source: Path | str, leaves: Leaves, finest_m: float, resolution_m: float | None
 ) -> Occupancy:
-    """Build the dense grid of a tree's box; there must be a leaf.
-
-    `finest_m` is the side of the tree's finest voxel, `resolution_m` that times a power of two; None for the
-    finest.
-    """
+    """Build the dense grid of a tree's box with a leaf; `resolution_m` is `finest_m` or so many times 2."""
     from pipelines.formats.maps.octree import fill
 
     halvings = _halvings(source, finest_m, resolution_m)

@@ -23,11 +23,7 @@ _STACK = 8 * (DEPTH + 1)
 def walk_binary(
     words: NDArray[np.uint16], key: Int32, depth: Bytes, log_odds: Float32, free: float, occupied: float
 ) -> int:
-    """Write the leaves of a .bt tree, one word per inner node, depth first.
-
-    `key` [L, 3], `depth` and `log_odds` receive them. Return the number of words that the tree has, or
-    `BREAKS_OFF` or `TOO_DEEP`.
-    """
+    """Write the leaves of a .bt tree, a word per inner node; return the number of words, or an error."""
     stack = np.empty((_STACK, 4), dtype=np.int64)
     stack[0] = 0
     waiting, read, leaves = 1, 0, 0
@@ -66,11 +62,7 @@ def walk_binary(
 
 @cached
 def walk_full(children: Bytes, node: Int32, key: Int32, depth: Bytes) -> int:
-    """Find the leaves of a .ot tree: the record and the position of each; returns like `walk_binary`.
-
-    `children` [N] are the bit masks of the records; `node`, `key` [L, 3] and `depth` hold those without
-    children.
-    """
+    """Find the leaves of a .ot tree, `children` [N] its bit masks: record and position; see `walk_binary`."""
     stack = np.empty((_STACK, 4), dtype=np.int64)
     stack[0] = 0
     waiting, read, leaves = 1, 0, 0

@@ -81,11 +81,7 @@ def read_frame_times(path: Path) -> FrameStamps:
 
 
 def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
-    """Return the times of a video's frames [N], and True where known, by their presentation times.
-
-    If the stamps have `media_ns`, each frame takes the nearest one within half a frame, because subtitles
-    round to a millisecond. Else frames are matched by number.
-    """
+    """Return the times of a video's frames [N], and True where known, by `media_ns`, else by number."""
     keys, wanted = stamps.frame, np.arange(len(pts_ns), dtype=np.int64)
     tolerance = 0
     if stamps.media_ns is not None:

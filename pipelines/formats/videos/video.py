@@ -633,11 +633,7 @@ def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[V
 
 
 def is_shown(packet: Packet[VideoStream], codec: str) -> bool:
-    """Test if a coded frame gives a picture.
-
-    VP8 and VP9 code frames that are only referred to. VP8: RFC 6386, section 9.1. VP9: bitstream
-    specification 0.6, section 6.2 and annex B.
-    """
+    """Test if a coded frame gives a picture (RFC 6386, section 9.1; VP9 specification 0.6, 6.2 and B)."""
     if codec not in {"vp8", "vp9"}:
         return True
     content = bytes(packet)

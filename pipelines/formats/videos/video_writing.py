@@ -43,11 +43,7 @@ def write_h264(
     height: int,
     bits_per_s: int | None = None,
 ) -> None:
-    """Encode pictures [height, width, 3] BGR (even sides) as an H.264 MP4, 4:2:0, in one thread.
-
-    `pts_ns` [N] are strictly increasing times of showing, at least 0. Without `bits_per_s` the quality is
-    constant.
-    """
+    """Encode pictures [H, W, 3] BGR (even sides) as an H.264 MP4 in one thread, shown at `pts_ns` [N]."""
     import av
 
     ticks = ticks_of(pts_ns)

@@ -29,23 +29,14 @@ _ONE_BODY_DEG = 45.0
 
 
 def doubts_of_logs(cameras: Mapping[str, tuple[CameraEntry, Trajectory]]) -> list[Doubt]:
-    """Find cameras that fly the same path, or whose logs start at the same place.
-
-    Args:
-        cameras: entry and logged poses by name.
-    """
+    """Find cameras that fly the same path, or whose logs start at the same place."""
     moving = {name: camera for name, camera in cameras.items() if not camera[0].poses.static}
     found = (_doubt_of_two(dict(pair)) for pair in combinations(moving.items(), 2))
     return [doubt for doubt in found if doubt is not None]
 
 
 def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Float] | None) -> list[Doubt]:
-    """Find cameras, and a map, that lie too far from the others to be of one flight.
-
-    Args:
-        cameras: logged poses by name.
-        map_box: smallest and largest corner [3] m of the first map.
-    """
+    """Find cameras, and a map (by its corners), that lie too far from the others to be of one flight."""
     middle = {name: np.median(track.position, axis=0) for name, track in cameras.items()}
     doubts = []
     all_far = [_apart_m(*two) for two in combinations(middle.values(), 2)]

@@ -62,11 +62,7 @@ class Eliminated:
 
 
 def eliminate(system: System, state: State) -> Eliminated:
-    """Linearise at a state and eliminate.
-
-    Raises:
-        LinAlgError: the equations are singular.
-    """
+    """Linearise at a state and eliminate; LinAlgError: the equations are singular."""
     from scipy.linalg.lapack import dpotrf
 
     n, front = 3 * system.problem.joints, _begin(system, state)
@@ -359,11 +355,7 @@ def eliminate_block(
 def forwards(
     first: int, last: int, sweep: Sweep, front: Float, gradient: Float, interval: int, factors: Factors
 ) -> tuple[int, float]:
-    """Eliminate joints and knots of the times from `first` to before `last`; change the front in place.
-
-    Writes the factors. Returns the interval of the time `last`, in which the front ends, and half the log
-    determinant of all eliminated unknowns, white errors included.
-    """
+    """Eliminate the times from `first` to before `last`; return the last's interval, and half the log det."""
     position, shared = sweep.equations.state.position, sweep.equations.state.shared
     knots, bones = sweep.equations.state.knots, sweep.bones
     starts, of_time, grown = sweep.starts, sweep.of_time, sweep.grown

@@ -345,13 +345,7 @@ def _of_lasting_errors(system: System, position: Float) -> Float:
 
 
 def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, Float]:
-    """Remove errors from poses: position [N, 3] m and world_from_camera [N, 3, 3].
-
-    Args:
-        position: [N, 3] m, as logged.
-        rotation: [N, 3, 3] as logged.
-        numbers: [N, 10] the corrections at the same times; the caller applies the clock's.
-    """
+    """Remove the corrections `numbers` [N, 10] from positions [N, 3] m and world_from_camera [N, 3, 3]."""
     turns = np.ascontiguousarray(numbers[:, ROTATION : ROTATION + 3])
     true_rotation = np.einsum("nij,nkj->nik", rotation, turned(turns))
     shift = numbers[:, :3] + np.einsum("nij,nj->ni", true_rotation, numbers[:, 6:9])

@@ -180,13 +180,7 @@ class Sighting:
 
 
 def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
-    """Build the problem: sort pictures by the skeleton's times around them; leave out those near none.
-
-    Args:
-        t_s: [T] strictly increasing times of the skeleton, at least three.
-        sightings: keypoints and poses of each camera.
-        bones: [B, 2] joints with a nearly constant distance.
-    """
+    """Build the problem of times [T] and `bones` [B, 2]; pictures near none of the times are left out."""
     step = float(np.median(np.diff(t_s)))
     covariances, logged, parts = [np.empty((0, 6, 6))], 0, []
     for camera, sighting in enumerate(sightings):
