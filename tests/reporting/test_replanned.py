@@ -214,13 +214,9 @@ def test_long_flight_is_thinned_and_says_so(content: SessionContent, monkeypatch
     )
     scene = _scene(long_flight)
     joints = _joints(scene)
-    # Per time: 17 joints of 3 + 3 numbers of 2 bytes, a middle and a height of 16, three cameras of 20 each.
-    per_time, ellipsoids = 17 * 6 * 2 + 16 + 60, 17 * 6 * 2
-    every = -(-frames * per_time // (3 * 1_500_000 // 4))
-    held = frames // every
-    ellipsoids_every = -(-held * ellipsoids // (1_500_000 - held * per_time))
-    assert (every, ellipsoids_every) == (2, 1)
-    assert len(joints) == held
+    # Per time: 17 joints of 12 numbers of 2 bytes, a middle and a height of 16, three cameras of 20 each.
+    every = -(-frames * (17 * 12 * 2 + 16 + 60) // 1_500_000)
+    assert len(joints) == frames // every
     assert [numbers(note) for note in scene.notes] == [[2, 6000]]
     expected = true_positions(np.arange(0, frames, every) / 30)[:, JOINTS.index("left_hip")]
     hip = joints[:, 0, JOINTS.index("left_hip")] + _origin(scene, long_flight)
