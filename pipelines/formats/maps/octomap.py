@@ -60,14 +60,6 @@ class Leaves:
         return key.min(axis=0) - _CENTRE, corner.max(axis=0) - _CENTRE
 
 
-@dataclass(frozen=True)
-class _OctomapHeader:
-    kind: str  # bt, ot, legacy bt
-    id: str
-    resolution_m: float
-    nodes: int | None
-
-
 class OctomapFormat(MapFile):
     """Reader into the tree's voxels, or 2, 4, 8, ... times wider ones with the largest probability inside."""
 
@@ -82,8 +74,8 @@ class OctomapFormat(MapFile):
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read the whole tree into a grid of its box."""
-        header, leaves = _read(path)
-        return occupancy_from(path, leaves, header.resolution_m, resolution_m)
+        finest_m, leaves = _read(path)
+        return occupancy_from(path, leaves, finest_m, resolution_m)
 
 
 def occupancy_from(
@@ -152,38 +144,34 @@ def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves
     return Leaves(key, depth, log_odds, nodes=used)
 
 
-def _read(path: Path) -> tuple[_OctomapHeader, Leaves]:
+def _read(path: Path) -> tuple[float, Leaves]:
+    """Return the side of the finest voxel, and the leaves."""
     content = read_bytes(path)
-    header, payload = _split(path, content)
-    check_resolution(path, header.resolution_m)
-    leaves = leaves_of(path, payload, is_binary=header.kind != "ot", tree=header.id)
-    if header.nodes is not None and header.nodes != leaves.nodes:
-        raise damaged(path, f"has {leaves.nodes} nodes where its header states {header.nodes}")
-    if not len(leaves.depth):
-        raise DataError(path, "is an empty map: nothing in it is known", "leave `map:` out", code="empty")
-    return header, leaves
-
-
-def _split(path: Path, content: bytes) -> tuple[_OctomapHeader, Bytes]:
+    tree, is_binary = "OcTree", not content.startswith(_FULL)
     if _is_legacy(content):
         _, resolution_m, nodes = _LEGACY.unpack_from(content)
-        return _OctomapHeader("legacy bt", "OcTree", resolution_m, nodes), np.frombuffer(content, np.uint8)[
-            _LEGACY.size :
-        ]
-    if not content.startswith((_BINARY, _FULL)):
+        payload = np.frombuffer(content, np.uint8)[_LEGACY.size :]
+    elif not content.startswith((_BINARY, _FULL)):
         problem = "is no OctoMap file"
         raise DataError(path, problem, f"its first line must be {_BINARY.decode()!r}", code="wrong-kind")
-    lines, payload = split_header(path, content, "data")
-    values = {words[0]: words[1] for words in lines if len(words) == 2}
-    try:
-        resolution_m = float(values["res"])
-        nodes = int(values["size"]) if "size" in values else None
-    except KeyError as error:
-        raise damaged(path, "its header states no res") from error
-    except ValueError as error:
-        raise damaged(path, f"its header cannot be read ({str(error)[:100]})") from error
-    kind = "bt" if content.startswith(_BINARY) else "ot"
-    return _OctomapHeader(kind, values.get("id", "OcTree"), resolution_m, nodes), payload
+    else:
+        lines, payload = split_header(path, content, "data")
+        values = {words[0]: words[1] for words in lines if len(words) == 2}
+        try:
+            resolution_m = float(values["res"])
+            nodes = int(values["size"]) if "size" in values else None
+        except KeyError as error:
+            raise damaged(path, "its header states no res") from error
+        except ValueError as error:
+            raise damaged(path, f"its header cannot be read ({str(error)[:100]})") from error
+        tree = values.get("id", tree)
+    check_resolution(path, resolution_m)
+    leaves = leaves_of(path, payload, is_binary=is_binary, tree=tree)
+    if nodes not in (None, leaves.nodes):
+        raise damaged(path, f"has {leaves.nodes} nodes where its header states {nodes}")
+    if not len(leaves.depth):
+        raise DataError(path, "is an empty map: nothing in it is known", "leave `map:` out", code="empty")
+    return resolution_m, leaves
 
 
 def _is_legacy(content: bytes) -> bool:
