@@ -142,8 +142,6 @@ from pipelines.session.tables import (
 RECONSTRUCT = Stage("reconstruct", revision=33)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
-# Detectors place joints in sharp pictures of this size to about three pixels.
-PIXEL_SIGMA_PX = 3.0
 
 
 @dataclass(frozen=True)
@@ -593,7 +591,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
         if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss
-            solve = solver_for("robust", cameras, observations, pixel_sigma=PIXEL_SIGMA_PX)
+            solve = solver_for("robust", cameras, observations)
             result = refused_people(solve(views), observations, seen.anybody)
     if binding is not None:
         result = replace(result, covariance=result.covariance + binding.common)
@@ -747,8 +745,8 @@ class _Triangulated:
 def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
     seen = flight.waiting.put(_observe(flight, cameras))
     flight.waiting.release()
-    views = views_with_noise(cameras, seen.observations, pixel_sigma=PIXEL_SIGMA_PX)
-    solve = solver_for(flight.settings.method, cameras, seen.observations, pixel_sigma=PIXEL_SIGMA_PX)
+    views = views_with_noise(cameras, seen.observations)
+    solve = solver_for(flight.settings.method, cameras, seen.observations)
     if len(cameras) == 1:
         one = bodies_of_one_camera(
             seen.observations,
@@ -767,7 +765,7 @@ def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
 def _doubted(made: _Triangulated) -> list[str]:
     """Say of each person why they must not determine cameras and clocks; "" for those who do."""
     seen = made.seen
-    return doubted_people(seen.observations, made.views, made.result, seen.association.doubts, PIXEL_SIGMA_PX)
+    return doubted_people(seen.observations, made.views, made.result, seen.association.doubts)
 
 
 def _robust_flight(
@@ -785,7 +783,6 @@ def _robust_flight(
         prior=load_pose_errors(flight.description, cameras, flight.settings.pose_noise),
         measured=any(camera.errors is not None for camera in cameras),
         clock_sigma_s=clock_sigma_s,
-        pixel_sigma=PIXEL_SIGMA_PX,
         between=flight.between,
         workers=flight.workers,
         executor=flight.executor,
@@ -853,7 +850,7 @@ def find_people(
 ) -> tuple[Candidates, Association, Float]:
     """Collect all detections at common times, associate them with people, logged first; see `ray_sigma`."""
     found = candidates(cameras, between)
-    sigma = ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=PIXEL_SIGMA_PX)
+    sigma = ray_sigma(cameras, found.t_ns, found.position)
     time_s = (found.t_ns - found.t_ns[0]) / 1e9
     views = SightLines(found.rays, found.confidence, found.position, found.rotation, sigma)
     logged = np.stack([actor.hips_at(found.t_ns) for actor in actors], axis=1) if actors else None

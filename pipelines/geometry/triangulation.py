@@ -39,6 +39,9 @@ Method = Literal["dlt", "midpoint", "robust"]
 MIN_PARALLAX_DEG = 2.0
 """The least parallax. Below it, depth is about thirty times as uncertain as the other directions."""
 
+PIXEL_SIGMA_PX = 3.0
+"""Standard deviation per axis of a good keypoint: detectors place joints in sharp pictures to that."""
+
 GATE = 4.0
 """The gate in standard deviations of a view's image point: one good view in 3000 falls outside."""
 
@@ -79,25 +82,6 @@ class Views:
     pixel_sigma: Float  # [C] px, per axis, of a view of confidence 1
     pose_sigma: Float  # [F, C, 2] per axis: centre in m, rotation in rad; 0 where exact
 
-    def __post_init__(self) -> None:
-        n, cameras = self.weight.shape
-        instants = self.position.shape[0]
-        expected = {
-            "rays": (n, cameras, 2),
-            "pose_index": (n,),
-            "position": (instants, cameras, 3),
-            "rotation": (instants, cameras, 3, 3),
-            "focal": (cameras,),
-            "pixel_sigma": (cameras,),
-            "pose_sigma": (instants, cameras, 2),
-        }
-        for name, shape in expected.items():
-            actual = getattr(self, name).shape
-            if actual != shape:
-                raise ValueError(f"{name} has the shape {actual}, not {shape}")
-        if n and (self.pose_index.min() < 0 or self.pose_index.max() >= instants):
-            raise ValueError(f"pose_index leaves 0..{instants - 1}")
-
     def of(self, cameras: Bool) -> Views:
         """Take the views of some of the cameras [C]."""
         return replace(
@@ -129,23 +113,21 @@ class Triangulation:
 
 
 def triangulate(
-    views: Views, *, method: Method, min_views: int = 2, gate: float = GATE, with_covariance: bool = True
+    views: Views, *, method: Method, gate: float = GATE, with_covariance: bool = True
 ) -> Triangulation:
-    """Triangulate every joint-frame by a method of the module; ValueError for min_views below 2, or no gate.
+    """Triangulate every joint-frame by a method of the module.
 
     `gate` counts standard deviations of a view's image point, pixel and pose noise together. Covariances are
     NaN without `with_covariance`, which saves a third of the time. Statuses besides "ok": `not_detected` by
-    any camera; `few_views`: detected by fewer than `min_views`; `no_pose`: fewer of the detections have one;
+    any camera; `few_views`: detected by only one; `no_pose`: fewer of the detections have one;
     `low_parallax`: no two lines differ by `MIN_PARALLAX_DEG`; `rejected`: fewer views agree within `gate`
     (`robust`), or the point is behind a camera (`dlt`, `midpoint`, which reject no view).
     """
-    if min_views < 2 or not gate > 0:
-        raise ValueError(f"min_views={min_views}, gate={gate}: out of range")
     poses = _poses_of(views)
     blocks = []
     for first in range(0, max(len(views.weight), 1), _BLOCK):
         part = slice(first, first + _BLOCK)
-        blocks.append(_triangulate_block(_rows(views, part), poses, method, min_views, gate, with_covariance))
+        blocks.append(_triangulate_block(_rows(views, part), poses, method, gate, with_covariance))
     return Triangulation(*(np.concatenate(results) for results in zip(*blocks, strict=True)))
 
 
@@ -169,7 +151,7 @@ def _poses_of(views: Views) -> _Poses:
 
 
 def _triangulate_block(
-    views: Views, poses: _Poses, method: Method, min_views: int, gate: float, with_covariance: bool
+    views: Views, poses: _Poses, method: Method, gate: float, with_covariance: bool
 ) -> tuple[Float, Bool, Int8, Float, Int64, Float]:
     """Triangulate some joint-frames; return the fields of `Triangulation`."""
     at = views.pose_index
@@ -189,8 +171,8 @@ def _triangulate_block(
     wide = (apart & seen[:, :, None] & seen[:, None]).any(axis=(1, 2))
     reasons = (
         ("not_detected", ~detected.any(axis=1)),
-        ("few_views", detected.sum(axis=1) < min_views),
-        ("no_pose", seen.sum(axis=1) < min_views),
+        ("few_views", detected.sum(axis=1) < 2),
+        ("no_pose", seen.sum(axis=1) < 2),
         ("low_parallax", ~wide),
     )
     status = np.select([where for _, where in reasons], [STATUS.index(word) for word, _ in reasons], 0)
@@ -206,7 +188,7 @@ def _triangulate_block(
 
         view = np.concatenate([rays, direction, length2[..., None], *noise], axis=-1)
         pairs = _pair_table(seen.shape[1])
-        fit_robustly(view, poses.rows, at, *pairs, gate**2, cos2_min, min_views, point, inlier, status)
+        fit_robustly(view, poses.rows, at, *pairs, gate**2, cos2_min, point, inlier, status)
     place = (rotation.mT @ (point[:, None] - centre)[..., None])[..., 0]
     if method != "robust":
         behind = (seen & ~(place[..., 2] > 0)).any(axis=1)

@@ -205,7 +205,6 @@ def _consensus(
     pairs: Int64,
     gate2: float,
     cos2_min: float,
-    min_views: int,
 ) -> tuple[float, float, float, int]:
     """Find the best point of all pairs of views by truncated cost over all views; refine it on inliers."""
     best = math.inf
@@ -254,7 +253,7 @@ def _consensus(
         if not changed:
             break
     # Two views have only their epipolar distance, one degree of freedom for both errors.
-    if changed or count < min_views or (count == 2 and total > gate2):
+    if changed or count < 2 or (count == 2 and total > gate2):
         return bx, by, bz, REJECTED
     # Two views that agree by chance look like two that are right. They count only without a rival pair.
     if count == 2 and _is_rivalled(view, used, camera, pairs, gate2, cos2_min):
@@ -271,7 +270,6 @@ def fit_robustly(
     pair_count: Int64,
     gate2: float,
     cos2_min: float,
-    min_views: int,
     point: Float,
     inlier: Bool,
     status: Int8,
@@ -304,7 +302,7 @@ def fit_robustly(
                             if pairs_by_count[count, p, end] == number:
                                 pairs[p, end] = c
                     number += 1
-            x, y, z, status[n] = _consensus(view[n], seen, used, cameras, pairs, gate2, cos2_min, min_views)
+            x, y, z, status[n] = _consensus(view[n], seen, used, cameras, pairs, gate2, cos2_min)
         point[n, 0] = x
         point[n, 1] = y
         point[n, 2] = z

@@ -19,7 +19,7 @@ from pipelines.geometry.arrays import Bool, Float, Float32, Int64, Intrinsics
 from pipelines.geometry.cameras import project, undistort
 from pipelines.geometry.noise import NoiseModel, disturb, pose_errors, sum_sigma
 from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, rates, transform
-from pipelines.geometry.triangulation import Views, triangulate
+from pipelines.geometry.triangulation import PIXEL_SIGMA_PX, Views, triangulate
 from pipelines.planning.arms import Arm, RollingOut
 from pipelines.planning.config import MOST_DRONES, PlannerConfig
 from pipelines.planning.distance_field import DistanceField, MapsInTurn, looked, open_space, visible
@@ -299,8 +299,6 @@ PLANNED = "planned"
 """Name of the other arm that is no planner: the commands of the planner on board, as logged."""
 LOGGED = (FLOWN, PLANNED)
 
-# The same standard deviation of a good keypoint is the first guess of `mocap reconstruct`.
-PIXEL_SIGMA_PX = 3.0
 # The joint estimate lets joints accelerate by this factor, or it would smooth kicks (`refine`).
 FAST_MOTION = 2.0
 # A person who stands sways; without any acceleration one error would be that of the whole flight.

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.geometry.triangulation import Views, triangulate
+from pipelines.geometry.triangulation import PIXEL_SIGMA_PX, Views, triangulate
 
 # --- tuning ---
 
@@ -145,9 +145,7 @@ def initial_offsets_s(views_at: Callable[[float], Views], instants: int, clock_s
     return initial_s
 
 
-def wrong_clocks(
-    views_at: Callable[[float], Views], t_s: Float, questioned: Bool, pixel_sigma: float, reference: int
-) -> Float:
+def wrong_clocks(views_at: Callable[[float], Views], t_s: Float, questioned: Bool, reference: int) -> Float:
     """Find clocks [C] s at whose stated times views disagree clearly more than at other times; 0 for others.
 
     One clock after the other is moved: that which lowers the disagreement most, so most must be right.
@@ -172,7 +170,7 @@ def wrong_clocks(
             return np.inf
         after = _changing_px(missed, window)
         price = 1 + RATIO_PER_S * abs(shift_s)
-        return price * after / before[camera] if after <= MAX_LEFT_SIGMAS * pixel_sigma else np.inf
+        return price * after / before[camera] if after <= MAX_LEFT_SIGMAS * PIXEL_SIGMA_PX else np.inf
 
     while open_ and np.count_nonzero(offset_s) < len(offset_s) - 1:  # one clock gives the time
         stated = {camera: _missed_px(current, len(t_s), camera) for camera in open_}

@@ -24,6 +24,7 @@ import pandas as pd
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import WHITE_SHARE, NoiseModel, PoseErrors, pose_errors
 from pipelines.geometry.triangulation import (
+    PIXEL_SIGMA_PX,
     STATUS,
     Triangulation,
     Views,
@@ -107,7 +108,6 @@ class RobustFlight:
     prior: Sequence[PoseErrors] | None  # of each camera's pose; None without stated noise
     measured: bool  # the prior was measured, and not only stated
     clock_sigma_s: Float  # [C] prior standard deviation of each clock offset, 0 for a known clock
-    pixel_sigma: float  # px, of a good keypoint
     between: Interpolation  # rules for interpolating between logged poses
     workers: int  # see `refine_in_windows`
     executor: Executor | None  # works on the windows instead
@@ -153,7 +153,7 @@ class RefinedFlight:
 
 
 def doubted_people(
-    observations: Observations, views: Views, result: Triangulation, doubts: Sequence[str], pixel_sigma: float
+    observations: Observations, views: Views, result: Triangulation, doubts: Sequence[str]
 ) -> list[str]:
     """Say of each person [P] why they must not determine cameras and clocks; "" for those who do.
 
@@ -182,7 +182,7 @@ def doubted_people(
     sure = [level for level, doubt in zip(levels, doubts, strict=True) if not doubt and np.isfinite(level)]
     if not sure:
         return [""] * len(levels)
-    most = _LARGEST_RATIO * max(sure[0], pixel_sigma**2)
+    most = _LARGEST_RATIO * max(sure[0], PIXEL_SIGMA_PX**2)
     return [
         doubt or ("residual" if level > most else "") for level, doubt in zip(levels, doubts, strict=True)
     ]
@@ -247,7 +247,6 @@ def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, refere
             lambda shift_s: views_at(shift_s).of(held),
             flight.t_s[rows],
             questioned[held],
-            flight.pixel_sigma,
             beside.index(reference) if reference in beside else 0,
         )
     suspect = offset_s != 0
@@ -344,7 +343,7 @@ def _start_with_offsets(flight: RobustFlight, offset_s: Float) -> Float:
         found = triangulate_pictures(
             replace(views, pixel_sigma=estimate_noise(views)),
             picture=pictures_of(observed),
-            pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
+            pixel_sigma=np.full(len(flight.cameras), PIXEL_SIGMA_PX),
         )
         start[own] = found.points.reshape(-1, *start.shape[1:])
     return start
@@ -412,7 +411,7 @@ def _observe_refined(refined: Refined, flight: RobustFlight, offset_s: Float) ->
         views,
         position=position,
         rotation=rotation,
-        pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
+        pixel_sigma=np.full(len(flight.cameras), PIXEL_SIGMA_PX),
         pose_sigma=np.zeros_like(views.pose_sigma),
     )
     views = replace(views, pixel_sigma=estimate_noise(views))
@@ -441,7 +440,7 @@ def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
         position=position,
         rotation=rotation,
         focal_px=camera.focal_px,
-        pixel_sigma=flight.pixel_sigma,
+        pixel_sigma=PIXEL_SIGMA_PX,
         pose_covariance=None if flight.prior is None else white_covariance(camera, flight.prior[c]),
         loosened=None if camera.loosened is None else camera.loosened_at(frame_t_ns),
     )

@@ -17,6 +17,7 @@ import numpy as np
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import ROTATION, UNKNOWN_SIGMA, PoseErrors
 from pipelines.geometry.triangulation import (
+    PIXEL_SIGMA_PX,
     STATUS,
     Method,
     Triangulation,
@@ -30,7 +31,7 @@ from pipelines.reconstruction.observations import Camera, Candidates, Observatio
 from pipelines.session.errors import NoViewsError
 
 
-def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_sigma: float) -> Float:
+def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float) -> Float:
     """Compute the standard deviation [T, C] rad of a viewing ray, accurate enough to associate people.
 
     The distance to the actor is not known yet: that to the middle of the cameras replaces it, because they
@@ -46,12 +47,12 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_
         sigma = np.tile(UNKNOWN_SIGMA, (len(t_ns), 1)) if stated is None else stated
         away = position[posed[:, c], c] - middle
         distance = float(np.median(np.linalg.norm(away, axis=-1))) if len(away) else 1.0
-        pixel = pixel_sigma / camera.focal_px
+        pixel = PIXEL_SIGMA_PX / camera.focal_px
         columns.append(np.sqrt(pixel**2 + sigma[:, 1] ** 2 + (sigma[:, 0] / max(distance, 1.0)) ** 2))
     return np.stack(columns, axis=1)
 
 
-def views_with_noise(cameras: Sequence[Camera], observations: Observations, *, pixel_sigma: float) -> Views:
+def views_with_noise(cameras: Sequence[Camera], observations: Observations) -> Views:
     """Build the views; residuals that the stated noise does not explain are added as pixel noise."""
     times, people, joints, count = observations.confidence.shape
     focal = np.array([camera.focal_px for camera in cameras])
@@ -63,7 +64,7 @@ def views_with_noise(cameras: Sequence[Camera], observations: Observations, *, p
         position=observations.position,
         rotation=observations.rotation,
         focal=focal,
-        pixel_sigma=np.full(count, pixel_sigma),
+        pixel_sigma=np.full(count, PIXEL_SIGMA_PX),
         pose_sigma=np.zeros((times, count, 2)) if stated is None else stated,
     )
     return replace(views, pixel_sigma=estimate_noise(views))
@@ -73,8 +74,6 @@ def solver_for(
     method: Method | Literal["refined", "auto"],
     cameras: Sequence[Camera],
     observations: Observations,
-    *,
-    pixel_sigma: float,
 ) -> Callable[[Views], Triangulation]:
     """Choose the solver from views to points; for `refined` and `auto`, the solver of their start.
 
@@ -86,7 +85,7 @@ def solver_for(
         return triangulate_heavy_tailed
     if method in ("dlt", "midpoint"):
         return partial(triangulate, method=method)
-    picture, of_detector = pictures_of(observations), np.full(len(cameras), pixel_sigma)
+    picture, of_detector = pictures_of(observations), np.full(len(cameras), PIXEL_SIGMA_PX)
     in_pictures = partial(triangulate_pictures, picture=picture, pixel_sigma=of_detector)
     if observations.pose_sigma is None:
         return partial(triangulate_widened, solve=in_pictures)

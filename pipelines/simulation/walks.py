@@ -20,6 +20,7 @@ from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates
 from pipelines.geometry.rig import BodyMotion
 from pipelines.geometry.triangulation import (
+    PIXEL_SIGMA_PX,
     Method,
     Views,
     estimate_noise,
@@ -39,9 +40,6 @@ RANGE_M = 10.0
 
 CIRCLE_M = 15.0
 """Radius of the way: the person is seen from all sides."""
-
-PIXEL_SIGMA = 3.0
-"""Standard deviation of a good keypoint for triangulation, px: the default of `mocap reconstruct`."""
 
 MIN_CONFIDENCE = 0.3
 """Least confidence of keypoints that are used: the default of `mocap reconstruct`."""
@@ -215,7 +213,7 @@ def views_of(
         position=position,
         rotation=rotation,
         focal=np.full(cameras, (seen_by.lens.fx + seen_by.lens.fy) / 2),
-        pixel_sigma=np.full(cameras, PIXEL_SIGMA),
+        pixel_sigma=np.full(cameras, PIXEL_SIGMA_PX),
         pose_sigma=sigma,
     )
 
