@@ -691,7 +691,7 @@ def verdict(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[s
         less = "" if gain is None else f": a second drone across would leave about {gain:.0f} mm"
         why.insert(len(doubts), f"one camera does not measure how far away a person is{less}")
     if cameras > 1 and kind in ("stated", "logged") and expected is not None and expected[1] > USABLE_MM:
-        why.insert(len(doubts), f"the {kind} errors of the poses are that large: record better poses")
+        why.insert(len(doubts), "the poses are known no better than that: record better ones")
     if cameras == 2:
         why.append("there are two cameras: nothing shows which of them is wrong where they disagree")
     if kind in ("estimated", "assumed"):
