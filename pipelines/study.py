@@ -84,6 +84,7 @@ from pipelines.simulation.walks import (
     formation,
     model_keypoints,
     numbers,
+    single,
     triangulate_robustly,
     views_of,
     walk,
@@ -425,7 +426,7 @@ def _walks(stated: Stated, flight: LoggedFlight, maps: Sequence[Occupancy]) -> d
     if len(texts) != 1 or not texts[0].isdigit():
         return {text: walked_otherwise(flight, _walk_of(text), maps) for text in texts}
     walks = {_walk_name(0): flight}
-    seed = _whole(stated, "seed", 0, 2**32 - 1, 0)
+    seed = single(stated, "seed", int, 0, 2**32 - 1, 0)
     for k in range(1, len(_walk_names(texts))):
         rng = np.random.default_rng([seed, k])
         for tries in range(_MOST_TRIES):
@@ -539,20 +540,13 @@ def _replay_settings(stated: Stated) -> ReplanSettings:
     settings = settings_of(
         stated.get("config", ()),
         arms=None,
-        trials=_whole(stated, "trials", 1, 10_000, ReplanSettings().trials),
-        seed=_whole(stated, "seed", 0, 2**32 - 1, 0),
+        trials=single(stated, "trials", int, 1, 10_000, ReplanSettings().trials),
+        seed=single(stated, "seed", int, 0, 2**32 - 1, 0),
         pose_noise=" + ".join(stated["pose_noise"]) if "pose_noise" in stated else None,
     )
     for cell in _cells({name: values for name, values in stated.items() if name in _varied(stated)}):
         _planner_of(settings.planner, cell)
     return settings
-
-
-def _whole(stated: Stated, name: str, least: int, most: int, default: int) -> int:
-    found = numbers(stated, name, int, least, most, (str(default),))
-    if len(found) > 1:
-        raise DataError(name, "takes one value", "leave the others out", code="bad-value")
-    return int(found[0])
 
 
 def _cells(varied: Stated) -> Iterator[dict[str, Any]]:

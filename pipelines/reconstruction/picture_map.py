@@ -428,11 +428,7 @@ def lay_on_places(
     places: Float,
     errors: PoseErrors | None,
 ) -> LaidMap:
-    """Lay a map on logged places [N, 3] m (z up) of its camera, at times [N]; key pictures have times [P].
-
-    `errors` is the prior of the places' errors; None takes the residuals of the fit. NoAttitudesError: the
-    places do not determine the attitudes, or do not fit the map.
-    """
+    """Lay a map on its camera's logged places [N, 3] m (z up) at times [N]; key pictures have times [P]."""
     from scipy.interpolate import CubicSpline
     from scipy.linalg import cholesky
 

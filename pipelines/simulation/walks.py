@@ -9,7 +9,7 @@ numbers in every formation and for every size of the errors, so that differences
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -52,6 +52,7 @@ _SPEED_MPS = 1.2
 # The person starts from a stand, and filming begins when it has become a walk.
 _UNDER_WAY_S = 2.0
 _AIM_S, _AIM_STEP_S = 1.0, 0.05  # cameras follow the mean over a stride, not every bob of the hip
+T = TypeVar("T", int, float)
 # One random stream for each.
 _POSES, _KEYPOINTS = range(2)
 
@@ -322,7 +323,7 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
                         code="no-such-name")  # fmt: skip
     (keypoints,) = _choices(values, "keypoints", ("model", "exact"))
     seconds, rate_hz = (
-        _single(values, name, 0.1, most, default)
+        single(values, name, float, 0.1, most, default)
         for name, most, default in (("seconds", 600, 75), ("rate_hz", 240, 30.0))
     )
     methods = _choices(values, "method", METHODS)
@@ -349,10 +350,10 @@ def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
         tuple(noise),
         tuple(name for name in METHODS if name in methods),
         "exact" if keypoints == "exact" else "model",
-        float(seconds),
-        float(rate_hz),
-        int(_single(values, "trials", 1, 10_000, 10)),
-        int(_single(values, "seed", 0, 2**32 - 1, 0)),
+        seconds,
+        rate_hz,
+        single(values, "trials", int, 1, 10_000, 10),
+        single(values, "seed", int, 0, 2**32 - 1, 0),
     )
 
 
@@ -400,14 +401,19 @@ def numbers(
     return found
 
 
-def _single(
-    values: Mapping[str, Sequence[str]], name: str, least: float, most: float, default: float
-) -> float:
-    found = numbers(values, name, float, least, most, (f"{default:g}",))
+def single(
+    values: Mapping[str, Sequence[str]],
+    name: str,
+    number: Callable[[str], T],
+    least: float,
+    most: float,
+    default: float,
+) -> T:
+    """Read the number of a variable that takes one value; DataError as for `numbers`."""
+    found: list[T] = numbers(values, name, number, least, most, (f"{default:g}",))
     if len(found) > 1:
         raise DataError(name, "takes one value", "leave the others out", code="bad-value")
-    value: float = found[0]
-    return value
+    return found[0]
 
 
 def _choices(values: Mapping[str, Sequence[str]], name: str, known: Sequence[str]) -> Sequence[str]:

@@ -170,10 +170,7 @@ def sample(
 
 
 def _most_seen(camera: Camera) -> Int64:
-    """Return the detections of the person whom the camera shows in most pictures.
-
-    People are told apart by the detector's own number; where that person is missing, the next is taken.
-    """
+    """Return the detections of the person whom the camera shows most; in their absence of the next one."""
     found = camera.detections
     number, count = np.unique(found.person, return_counts=True)
     rank = np.empty(len(number), dtype=np.intp)
@@ -183,11 +180,7 @@ def _most_seen(camera: Camera) -> Int64:
 
 
 def _chosen(camera: Camera, of_frame: Int64) -> Int64:
-    """Return the detections that were chosen, by their rank [F] among those of their picture.
-
-    A camera of which few were chosen fits the others badly: its person is whom it shows most, since what is
-    wrong with it is what is looked for.
-    """
+    """Return the detections that were chosen, by their rank [F]; of whom it shows most if these are few."""
     frame = np.flatnonzero(of_frame >= 0)
     if len(frame) < _CHOSEN_SHARE * len(np.unique(camera.detections.frame)):
         return _most_seen(camera)
@@ -590,10 +583,7 @@ class Body:
         return Oddity(min(max(0.0, off - 0.15) / sigma, _MOST_TREAD), {"legs_over_pace": share})
 
     def _ahead(self, flight: Sampled, white_m: float) -> float:
-        """Return the cosine of where the person walks, over the flight, against where they face.
-
-        It is 1 of somebody who hardly walks, or is not upright most of the time.
-        """
+        """Return the cosine of where the person walks against where they face; 1 if they hardly walk."""
         first = np.arange(len(flight.t_ns))
         second = np.searchsorted(flight.t_ns, flight.t_ns + _WALK_NS, side="right") - 1
         step_s = (flight.t_ns[second] - flight.t_ns[first]) / 1e9

@@ -234,21 +234,12 @@ def _linear(
     placed: Float,
     pull: Float,
 ) -> tuple[Float, Float, Float]:
-    """Linearise the misses of rays, and solve for the joints.
+    """Linearise the misses of rays from places [C, T, 3] to joints [T, J, 3], and solve for the joints.
 
-    Args:
-        joints: [T, J, 3].
-        place: [C, T, 3] of the cameras.
-        ray: [C, T, J, 3].
-        probed_place: [n, C, T, 3] with each number changed by a step.
-        probed_ray: [n, C, T, J, 3].
-        root: [C, T, J] square roots of the weights; 0 of what is not used.
-        placed: [T, J] weights of known places of joints.
-        pull: [T, J, 3] towards them, times the weight.
-
-    Returns:
-        Weighted derivatives [C, 3 T J, 6 + n + 1] by each camera's shift and turn, by the numbers, and the
-        misses; those by the joints times these [3 T J, 6 C + n + 1]; and this with the joints solved.
+    Probed places [n, C, T, 3] and rays [n, C, T, J, 3] have one number each changed by a step; `root` [C, T,
+    J] are roots of weights; `placed` [T, J] are weights of known places, `pull` [T, J, 3] towards them.
+    Return weighted derivatives [C, 3 T J, 6 + n + 1] by each camera's shift and turn, by the numbers, and the
+    misses; those by the joints times these [3 T J, 6 C + n + 1]; and this with the joints solved.
     """
     cameras, times, names = root.shape
     numbers = len(probed_ray)
@@ -377,10 +368,7 @@ def picture_variance(scene: SceneOfMoments) -> Float:
 
 
 def _varying2(varying: Float, white: Float, times: int) -> Float:
-    """Return the variance [C] of errors that vary, as of one of so many pictures with independent errors.
-
-    What is not new in every pose is worth `FEW` independent pictures, however many there are.
-    """
+    """Return the variance [C] of errors that vary as of one picture; old parts are worth `FEW` pictures."""
     lasting2 = np.maximum(varying**2 - white**2, 0.0)
     return white**2 + lasting2 * times / FEW
 
@@ -596,23 +584,12 @@ def _scatter_of_pair(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[in
 def _crossings(
     ray: Float, depth: Float, seen: Bool, place: Float, rotation: Float, sigma: Float, pixel2: Float
 ) -> tuple[Int64, Float, Float, Float]:
-    """Compare the rays of two cameras along their common normals.
+    """Compare the rays [2, T, J, 3] of two cameras along their common normals.
 
     That distance changes by the normal with a shift of a camera, and by the lever (distance times ray) across
-    the normal with a turn.
-
-    Args:
-        ray: [2, T, J, 3] in the world.
-        depth: [2, T, J] m.
-        seen: [2, T, J].
-        place: [2, T, 3] m of the cameras.
-        rotation: [2, T, 3, 3] world_from_camera.
-        sigma: [2, 6] as `PoseSigma`.
-        pixel2: [2] variances of keypoints, rad^2.
-
-    Returns:
-        Indices [N] of joints whose rays cross; the derivatives [N, 12] of their distances by shift and turn
-        of each camera, in standard deviations; the distances [N] m and their variances [N] m^2.
+    the normal with a turn; `pixel2` [2] rad^2 are variances of keypoints. Return indices [N] of joints whose
+    rays cross; the derivatives [N, 12] of their distances by shift and turn of each camera, in standard
+    deviations; the distances [N] m and their variances [N] m^2.
     """
     _, times, names = seen.shape
     used, design = np.zeros(times * names, np.int64), np.zeros((times * names, 12))
@@ -652,10 +629,7 @@ def _crossings(
 def _place(
     flight: Sampled, scene: SceneOfMoments, body: Body, solved: SolvedJoints, stature: float
 ) -> dict[str, Oddity]:
-    """Measure how the person moves, and how far they are from where people are.
-
-    They are under drones, on the ground, and at the logged actor.
-    """
+    """Measure how the person moves, and how far they are from under drones, the ground, the logged actor."""
     known = solved.seen & (solved.views >= 2)
     far = [median(np.abs(depth[used])) for depth, used in zip(solved.depth, known, strict=True)]
     far_m = np.minimum(np.nan_to_num(np.array(far), nan=10.0), _FARTHEST_M)

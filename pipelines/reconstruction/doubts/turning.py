@@ -107,17 +107,8 @@ def _common(tracks: Tracks, begins: Int64, first: int, second: int) -> tuple[Int
 
 
 def _turned(before: Float, after: Float, logged: Float, moved: Float) -> Float:
-    """Return the rotation vectors [N, 3] that bring rays onto others, after what is logged of them.
-
-    Where the camera moved, a point tells the turn across the direction of that motion alone: how far away it
-    is does not matter.
-
-    Args:
-        before: [N, K, 3] at the first picture, in its camera.
-        after: [N, K, 3] at the second, in its own.
-        logged: [N, 3, 3] second camera from the first.
-        moved: [N, 3] m, from the second camera to where it was, in its own axes.
-    """
+    """Return rotation vectors [N, 3] that bring rays [N, K, 3] onto others, beside what is logged."""
+    # Where the camera moved, a point tells the turn across that motion alone: its distance is unknown.
     far = np.linalg.norm(moved, axis=1, keepdims=True) > _BASELINE_M
     normal = np.cross(np.where(far, moved, [1.0, 0.0, 0.0])[:, None], after)
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
@@ -223,17 +214,8 @@ def _gains(
     *,
     start_ns: int = 0,
 ) -> list[tuple[float, float, float]]:
-    """Return by how much other times lower the chi^2; the squares that they leave, and those of the turns.
-
-    The level of the logs' errors is estimated: N log of the ratio of mean squares.
-
-    Args:
-        camera: the camera.
-        turns: its turns.
-        between: how poses are interpolated.
-        times: seconds that are added, and factors of the times since the first picture.
-        start_ns: the time of the first picture.
-    """
+    """Return by how much other times (added s, factor) lower the chi^2; the squares left, those of turns."""
+    # The level of the logs' errors is estimated: N log of the ratio of mean squares.
     stated, _ = _left(camera, turns, between, turns.first_ns, turns.second_ns)
     found = []
     for late_s, slower in times:
