@@ -125,11 +125,7 @@ def order(label: Label) -> list[tuple[str, int]]:
 
 
 def camera_names(labels: Sequence[Label]) -> list[str]:
-    """Make a name for each camera, [A-Za-z0-9_-]{1,64}, such that no two differ only in case.
-
-    Numbered words that all labels share (a date, a take) are left out. Of the rest, a name has as many words
-    as are needed to distinguish the cameras.
-    """
+    """Name each camera by the fewest words that distinguish it; no two names differ only in case."""
     if len(labels) > 1:
         shared = Counter(word.key for label in labels for word in label if word.number is not None)
         common = {key for key, count in shared.items() if count == len(labels)}

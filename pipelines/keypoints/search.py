@@ -110,12 +110,7 @@ def actor_hints(
 
 
 def hint_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, t_ns: Int64) -> Float:
-    """Return the uncertainty [T, 2] of the logged actor as seen from a camera's logged pose, per axis.
-
-    First the position relative to the camera (m), with the errors of both, then the camera's rotation (rad),
-    each of the last logged pose before the picture: by the noise of the camera's entry in session.json, else
-    by the log's covariances.
-    """
+    """Return the uncertainty [T, 2] (m, rad) of the logged actor as seen from a camera's logged pose."""
     stated = stated_noise(name, entry, trajectory).sigma
     if stated is None:
         at_pictures = np.tile((0.0, UNKNOWN_SIGMA_RAD), (len(t_ns), 1))

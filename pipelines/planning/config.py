@@ -28,11 +28,7 @@ def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Cameras for the ray model: errors of the poses and, by tilt, of a detector; and the field of view.
-
-    A replay takes them from its session (`scene.build_scene`). The defaults are logs of usual drones, and
-    BlazePose as `simulation/data/blazepose_errors.csv` has it.
-    """
+    """Cameras for the ray model: errors of poses and, by tilt, of BlazePose; and the field of view."""
 
     position_sigma_m: float = 0.3  # per axis
     rotation_sigma_deg: float = 1.0  # per axis

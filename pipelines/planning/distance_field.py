@@ -341,11 +341,7 @@ def looked(
 
 
 def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float) -> Bool:
-    """Test that no occupied voxel lies on the line of sight (Amanatides & Woo 1987).
-
-    Camera and actor are [..., 3] m, world, broadcast. The end next to the actor, `start_m`, is left out:
-    maps contain the actor. True also where they are nearer to each other than that, or not finite.
-    """
+    """Test that no occupied voxel lies on lines of sight (Amanatides & Woo 1987), but by the actor."""
     camera, actor = np.broadcast_arrays(camera, actor)
     seen = np.empty(camera.shape[:-1], dtype=np.bool_)
     _traverse(field.hiding or field.grid, _flat(camera), _flat(actor), start_m, seen.reshape(-1))

@@ -87,11 +87,7 @@ class FormationPath:
     aim: Float | None = None  # [n, P] shares of people in the place that each camera films; None: the middle
 
     def at(self, t_s: Float) -> Float:
-        """Return commanded slots [T, n, 3] at times [T]; constant before the first knot and after the last.
-
-        Slots move at the full rate and then wait for the next knot: plans are replaced many times before it,
-        so that an even approach would never leave the cell.
-        """
+        """Return slots [T, n, 3] at times [T]; they move at the full rate, then wait for the next knot."""
         slots = np.empty((len(t_s), *self.slots.shape[1:]))
         _commanded(self.knot_s, self.slots, self.rates, t_s, slots)
         return slots

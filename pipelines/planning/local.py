@@ -175,11 +175,7 @@ def roll_out(
     flying: Flying,
     states: Float,
 ) -> int:
-    """Follow a plan for some periods and then brake to a stop; return the row of the stop.
-
-    The plan is `path` [N + 1, 3] m, its first velocity and step. `states[0]` is the drone's, `after_s` after
-    the plan's start; the others of `states` [K + 1, 4, 3] are written, at rest after the stop.
-    """
+    """Follow a plan `path` [N + 1, 3], then brake: fill `states` after the first; return the stop's row."""
     x, v, a, wanted, scratch = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     braking = min(BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)
     last = states.shape[0] - 1

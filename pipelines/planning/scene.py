@@ -625,11 +625,7 @@ def build_scene(
 def with_pose_errors(
     errors: ErrorModel, flight: LoggedFlight, t_ns: Int64, position: Float, quaternion_xyzw: Float
 ) -> ErrorModel:
-    """Take the errors of the poses and the field of view from a flight; those of the detector are kept.
-
-    Errors are root mean squares over its cameras and times [T], along the poses as flown [C, T, 3] and [C,
-    T, 4]; of several fields of view the narrowest counts.
-    """
+    """Take the errors of the poses (RMS) and the narrowest field of view from a flight as flown."""
     rows = slice(None, None, max(len(t_ns) // NOISE_LOOKS, 1))
     elapsed_s = (t_ns[rows] - t_ns[0]) / 1e9
     sigma = [

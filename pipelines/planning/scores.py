@@ -110,11 +110,7 @@ def hidden_by_people(camera: Float, target: Float, people: Float) -> Bool:
 def sights(
     camera: Float, looks_rad: Float, people: Float, maps: DistanceField | MapsInTurn, config: PlannerConfig
 ) -> Bool:
-    """Test [P, N, T] which cameras [N, T, 3] see which people [P, T, 3] (the middle of the hips).
-
-    The person is in the level field of view of the axis' yaw [N, T], and neither the map nor anybody else
-    stands between. A single person is in every picture, so that only the map counts.
-    """
+    """Test [P, N, T] which cameras [N, T, 3] see whom, by field of view, map and other people."""
     seen = []
     for p, person in enumerate(people):
         free = seen_actor(camera, person, maps, config)

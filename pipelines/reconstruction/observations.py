@@ -277,11 +277,7 @@ def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
 
 
 def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float]:
-    """Return rays [F, P, J, 2] and confidence [F, P, J] of people in the camera's own frames; NaN unseen.
-
-    A frame of a slow camera appears at several times of the timeline: the time nearest to it decides. Rays of
-    a rolling shutter are those of the frames' stamps.
-    """
+    """Return rays [F, P, J, 2] and confidence [F, P, J] of people in a camera's own frames; NaN unseen."""
     rays, confidence, delay_s = _chosen(camera, found, c, choice)
     if camera.intrinsics.readout_s:
         rays = rays - np.nan_to_num(_velocity(camera, rays, delay_s) * delay_s[..., None])

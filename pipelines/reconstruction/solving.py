@@ -32,11 +32,7 @@ from pipelines.session.errors import NoViewsError
 
 
 def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float) -> Float:
-    """Compute the standard deviation [T, C] rad of a viewing ray, accurate enough to associate people.
-
-    The distance to the actor is not known yet: that to the middle of the cameras replaces it, because they
-    surround the actor. DataError: no camera has a pose at any time.
-    """
+    """Compute the standard deviation [T, C] rad of rays, to people taken to be amid the cameras."""
     posed = ~np.isnan(position[..., 0])
     if not posed.any():
         raise NoViewsError("the cameras", "have no pose at any picture", "check clocks and pose logs")

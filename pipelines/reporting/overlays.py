@@ -292,11 +292,7 @@ def angles_at(motion: MeasuredMotion, angles: pd.DataFrame, name: str, t_ns: Int
 def views_of(
     camera: FilmedCamera, at: Int64, motion: MeasuredMotion, status: NDArray[np.int8], origin_ns: int
 ) -> list[OverlayView]:
-    """Reproject the skeleton into frames of a camera, beside the detections there; no pictures.
-
-    `at` [N] are rows of its frames and `status` [N, P, J] that of the joints there. The skeleton is
-    interpolated to the frames' times, never across a gap or a missing joint.
-    """
+    """Reproject the skeleton into frames `at` [N] of a camera, beside the detections; no pictures."""
     frame, t_ns = camera.frame[at], camera.frame_t_ns[at]
     skeleton = interpolate_points(
         motion.t_ns, motion.measured_position, t_ns, max_gap_ns=_longest_step_ns(motion)

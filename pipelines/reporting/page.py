@@ -37,11 +37,7 @@ def _template(name: str, **context: object) -> Markup:
 
 
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None, video: Video = "none") -> str:
-    """Render the complete HTML of a session's report.
-
-    `read_frame` reads the pictures behind the overlays; without it they are drawn on plain ground. `video`
-    says how many pictures stand beside the 3D view.
-    """
+    """Render the complete HTML of a session's report, its overlays on the pictures of `read_frame`."""
     summary = summarise(content)
     replan = _replan(summary, content)
     figures = {figure.key: figure for figure in _draw(summary, content, replan)}

@@ -40,11 +40,7 @@ def recognise(path: Path, protocol: type[F], noun: str, *, name: str | None = No
 
 
 def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: str | None = None) -> Format:
-    """Find the one registered format of some kinds that recognises a file; the user may state its name.
-
-    DataError if the path is missing, no format of the kinds knows it, several do, or the stated format is of
-    another kind. `noun` names such a file in messages.
-    """
+    """Find the one registered format of some kinds that recognises a file, or has the stated name."""
     if name is not None:
         stated = FORMATS.get(name)
         if isinstance(stated, protocols):

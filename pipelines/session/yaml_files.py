@@ -18,11 +18,7 @@ M = TypeVar("M", bound=YamlModel)
 
 
 def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape: str, made: str = "") -> M:
-    """Read and validate a file; one DataError holds every problem that was found.
-
-    `newest` is the newest value of the key `schema`. `noun` ("flight manifest"), `shape` (the file's form)
-    and `made` (how one is made) are for messages.
-    """
+    """Read and validate a file; one DataError holds every problem that was found."""
     how = f" ({made})" if made else ""
     raw = plain_yaml(path, read_text(path, most_bytes=MAX_FILE_BYTES))
     if not isinstance(raw, Mapping):

@@ -93,11 +93,7 @@ def read_errors(path: Path) -> ErrorTable:
 
 
 def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:
-    """Compute the pixels [T, J, 2] of joints [T, J, 3] m, NaN behind the camera and outside the picture.
-
-    World_from_camera is [T, 3] and [T, 4], or one of each joint ([T, J or 1, 3]). Nothing hides anything. The
-    corner pixels have their centres at (0, 0) and (width - 1, height - 1).
-    """
+    """Compute pixels [T, J, 2] of joints [T, J, 3] m, NaN behind the camera and outside the picture."""
     if position.ndim == 2:
         position, quaternion_xyzw = position[:, None], quaternion_xyzw[:, None]
     camera_from_world = invert(position, quaternion_xyzw)

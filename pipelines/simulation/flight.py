@@ -138,11 +138,7 @@ def fly_scenario(
     bvh: Mapping[str, SkeletalMotion] | None = None,
     planner: Callable[[World], Planner] | None = None,
 ) -> SimulatedFlight:
-    """Let the actors move, the drones fly, and the recorders run; `bvh` has recorded motions by actor.
-
-    Without a maker of planners, drones fly on a ring about where the first actor truly is, whatever stands in
-    the way. DataError: as `build_set`, or the flight is over before a drone takes its first picture.
-    """
+    """Let actors move, drones fly (by planners, else on a ring about the first actor), recorders run."""
     set_up = build_set(scenario, bvh=bvh)
     world, followed = set_up.world, set_up.people[0]
     span_s = _span_s(scenario)

@@ -457,11 +457,7 @@ def estimate_actor(
     span_s: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Int64, Float]:
-    """Simulate estimates of the actor's hip [T, 3] m: stamps [M], ns since the start, and positions [M, 3].
-
-    The error is a Gauss-Markov process: `sigma_m` per axis at any moment, and correlated over
-    ACTOR_CORRELATION_S. The log's span lies within `t_s`.
-    """
+    """Simulate estimates of the actor's hip with Gauss-Markov errors: stamps [M] ns, positions [M, 3]."""
     t_ns = log_times(rate_hz, span_s, rng)
     grid_ns = _nanoseconds(t_s)
     position = interpolate_points(grid_ns, hip, t_ns, max_gap_ns=int(np.ptp(grid_ns)) if len(grid_ns) else 0)

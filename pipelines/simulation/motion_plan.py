@@ -267,11 +267,7 @@ class Pace:
 
 
 def pace(parts: Sequence[WayPart]) -> Pace:
-    """Compute speeds over time from a stand to a stand; each part has its own where it is long enough.
-
-    Speed goes from one knot to the next as a smooth step, at `_WALK_MPS2` or `_RUN_MPS2` on average; where a
-    part is slower than the next, it is slower to its end.
-    """
+    """Compute speeds over time from a stand to a stand; long parts have their own, reached smoothly."""
     gains = [_RUN_MPS2 if part.run else _WALK_MPS2 for part in parts]
     between = [0.0, *(min(a.speed_mps, b.speed_mps) for a, b in pairwise(parts)), 0.0]
     for i, (part, gain) in enumerate(zip(parts, gains, strict=True)):

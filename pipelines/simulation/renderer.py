@@ -268,11 +268,7 @@ _MARGIN_PX = 3
 
 
 class DistortingLens:
-    """A lens that bends the light of a pinhole with the same focal length.
-
-    Light is interpolated by cubics before it is developed, so that the sensor's softness and noise are those
-    of a picture without distortion. ValueError: the distortion's model does not reach the whole picture.
-    """
+    """A lens that bends a pinhole's light; ValueError: its model does not reach the whole picture."""
 
     pinhole: Intrinsics
     """The camera whose picture holds all that the lens sees."""

@@ -165,11 +165,7 @@ def plant(
     standing: Sequence[scenario.Tree],
     walls: Sequence[scenario.Wall],
 ) -> list[scenario.Tree]:
-    """Place a wood's trees at random, evenly over its circle. DataError: they do not fit.
-
-    Trees keep apart from each other, from those standing and from walls, and no trunk's axis is nearer than
-    `clear_m` to a point [K, 2] m of the actor's way (`keep_clear`).
-    """
+    """Place a wood's trees at random, apart from all else, clear of the actor's way; DataError: no room."""
     trees = list(standing)
     for planted in range(wood.count):
         for _ in range(_TRIES):

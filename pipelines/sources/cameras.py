@@ -57,12 +57,7 @@ class FlightCameras:
     def frames(
         self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> CameraFrames:
-        """Read the time at which each picture was taken.
-
-        It is `fps` from `start` on, a file or topic of frame times, the stamps of pictures in a log, or the
-        container's own stamps from `start` on, as the manifest states, and the offset of the camera's clock.
-        DataError: there is no source of frame times, or it is unusable.
-        """
+        """Read the time at which each picture was taken; DataError: no usable source of times."""
         offset_ns = camera.clock.offset_ns if camera.clock else 0
         unclocked = self._unclocked_frames(name, camera, video, detections)
         return replace(unclocked, t_ns=unclocked.t_ns + offset_ns)

@@ -399,11 +399,7 @@ class FlightPoses:
         return placed.position.reshape(position.shape)
 
     def map(self, source: Path, grid: Occupancy, crs: str | None) -> Occupancy:
-        """Return a map in the world; `crs` is the stated one of its coordinates, else its own counts.
-
-        A stated CRS that puts the map elsewhere than its own is used, and is a doubt in `map_doubts`.
-        DataError: as for poses; also if a CRS is stated and the world's origin on Earth is not known.
-        """
+        """Return a map in the world; `crs` is the stated one of its coordinates, else its own counts."""
         origin = self.origin()
         if self._upright != Placement():
             scale = self._upright.scale

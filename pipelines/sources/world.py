@@ -133,11 +133,7 @@ def turn_of(place: Placement) -> Float:
 
 
 def refuse_projected(source: Path | str, position: Float, origin: Place, crs: str = "") -> None:
-    """Refuse coordinates of a map projection, such as UTM, in a world whose origin on Earth is known.
-
-    `crs` names the one that placed them, if one did. DataError: the median is more than 100 km from the
-    origin.
-    """
+    """Refuse coordinates of a map projection, such as UTM: over 100 km from a known origin on Earth."""
     across = position[np.isfinite(position[:, :2]).all(axis=1), :2]
     if not len(across):
         return

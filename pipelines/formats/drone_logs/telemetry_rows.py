@@ -87,11 +87,7 @@ def position_track(
     origin: Place | None = None,
     unusable: dict[str, Bool] | None = None,
 ) -> PositionTrack:
-    """Drop the positions that cannot be used; count each in `dropped` under its first cause.
-
-    The causes of `unusable` come first, then "not finite", "not on Earth" (latitude beyond 90, longitude
-    beyond 360), "no fix (0, 0)", "duplicate stamp" and "stamp out of order" as in `clean_poses`.
-    """
+    """Drop the positions that cannot be used; count each in `dropped` under its first cause."""
     causes: dict[str, Bool] = dict(unusable or {})
     with np.errstate(invalid="ignore"):
         causes["not finite"] = np.asarray(~np.isfinite(values).all(axis=1))
@@ -181,11 +177,7 @@ def pictures_on_gps_time(source: Path, t_ns: Int64, fit: ClockFit | None, choice
 
 
 def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:
-    """Return attitudes [N, 4] of an FLU gimbal in an ENU world, from angles with yaw relative to the nose.
-
-    `heading_from_gimbal` [N, 4] is an FRD gimbal in a level frame with x along the nose and z down. NaN if
-    the body's attitude is not known within a second.
-    """
+    """Return attitudes [N, 4] of an FLU gimbal in ENU, from an FRD one with yaw relative to the nose."""
     _, turned = interpolate_poses(
         body.t_ns,
         np.zeros((len(body.t_ns), 3)),

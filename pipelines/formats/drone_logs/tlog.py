@@ -95,11 +95,7 @@ class TlogFormat(DroneLog):
         return _read(path).vehicles()
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Read position, attitude and gimbal of one vehicle; `instance` is its system's number.
-
-        The position is GLOBAL_POSITION_INT, else LOCAL_POSITION_NED, else GPS_RAW_INT. Times are UTC by
-        SYSTEM_TIME; without it, those of the station.
-        """
+        """Read position, attitude and gimbal of one vehicle; `instance` is its system's number."""
         log = _read(path)
         system = _vehicle(path, log, choice.instance, _POSITIONS)
         notes = [f"took vehicle {system}"] if len(log.vehicles()) > 1 else []

@@ -76,11 +76,7 @@ class UlogFormat(DroneLog):
         return first_bytes(path, len(MAGIC)) == MAGIC
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Read position, attitude and gimbal.
-
-        The position is the estimator's local one if it is ever valid, else its global one, else that of GPS.
-        A local position that is never valid is the last choice, with a note.
-        """
+        """Read position (local if ever valid, else global, else GPS's), attitude and gimbal."""
         topics = read_topics(path, _WANTED)
         notes: list[str] = []
         fit = on_gps_time(path, _gps_time(topics), choice.time, notes)

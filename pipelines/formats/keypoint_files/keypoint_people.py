@@ -164,11 +164,7 @@ def _digits(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class KeypointFile:
-    """Reader of the people of a keypoint file, or of a folder with one for each picture.
-
-    `is_known` recognises the content of a JSON file (see `samples`), or the head of a table. `gather` adds
-    every person of `Gathering.path`.
-    """
+    """Reader of keypoints: `is_known` recognises JSON, or a table's head; `gather` adds everybody in it."""
 
     name: str
     title: str

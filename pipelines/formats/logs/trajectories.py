@@ -250,11 +250,7 @@ def _published_values(logged: Sequence[LoggedRows]) -> LoggedRows:
 
 
 def frames_of_poses(recording: Log, source: str, taken: Iterable[tuple[str | None, str | None]]) -> list[str]:
-    """Return the frames of a log's poses, each once, without the leading slash of ROS 1.
-
-    `taken` are topic and parent of each; a parent names the frame itself, and a missing topic means the only
-    one. Entries that do not fit the log are ignored; reading the poses reports them.
-    """
+    """Return the frames of a log's poses, each once, by the topic and parent of each in `taken`."""
     topics = [topic.name for topic in recording.topics if kind_of(topic) == "poses"]
     frames: list[str] = []
     for stated, parent in taken:

@@ -397,11 +397,7 @@ def _made_up(name: str, rigged: Rigged, frames: int) -> str:
 
 
 def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) -> None:
-    """Write a motion at the constant rate of its first and last time; `bvh.read_motion` reads it back.
-
-    The root has position and rotation channels, every other bone rotations in the order Z, X, Y, in degrees
-    without jumps of 360. A bone without children ends in a site of length 0.
-    """
+    """Write a motion at the constant rate of its first and last time; `read_motion` reads it back."""
     order = _IN_FILE[axes]
     scale = 1 / METRES[unit]
     frames = len(motion.t_s)

@@ -56,11 +56,7 @@ _SCREEN_UP = {"+Z": "z-up", "+Y": "y-up"}
 
 
 class C3dFormat:
-    """Reader of one person. Pose2Sim's labels get our joint names (RHip is right_hip), others keep theirs.
-
-    POINT:UNITS is used unless the user states the unit, and POINT:Y_SCREEN gives the up axis; without it z is
-    up.
-    """
+    """Reader of one person, by POINT:UNITS unless a unit is stated, and POINT:Y_SCREEN, else z up."""
 
     name = "c3d"
     title = "Biomechanics points (C3D)"

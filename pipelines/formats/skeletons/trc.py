@@ -98,11 +98,7 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
 
 
 class TrcExport:
-    """Writer of `<name>.trc`, or `<name>_<person>.trc` for each of several people; default metres and y up.
-
-    OpenSim's (x, y, z) is our world's (y, z, x). Times are seconds since `recording.zero_ns`, because
-    programs of biomechanics expect a trial to begin near zero.
-    """
+    """Writer of `<name>.trc`, or `<name>_<person>.trc`; OpenSim's (x, y, z) is our world's (y, z, x)."""
 
     name = "trc"
     title = "markers for OpenSim and Pose2Sim"

@@ -26,11 +26,7 @@ _FRAME_NAMES = {"frame", "frame_id", "frame_index", "frame_number"}
 
 @dataclass(frozen=True)
 class FrameStamps:
-    """Times of frames: frame numbers and times both strictly increase; frames may be absent.
-
-    `media_ns`, if present, identifies frames better than `frame` does: if a recorder skips a frame, the
-    video's own stamps have a gap, too.
-    """
+    """Times of frames, which strictly increase; frames may be absent, and `media_ns` identifies them best."""
 
     frame: Int64  # [N] from 0
     t_ns: Int64  # [N] since the epoch, or since the file's own zero

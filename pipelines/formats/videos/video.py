@@ -190,11 +190,7 @@ def black_bars(path: Path) -> tuple[int, int, int, int]:
 
 
 class VideoReader:
-    """Open video with its `index`; frames are read by number, in any order. A context manager.
-
-    Pictures are BGR, turned as in players, as large as the index says. `missing` holds the numbers of the
-    undecodable frames found so far.
-    """
+    """Open video with its `index`: BGR pictures by number in any order; `missing` are undecodable ones."""
 
     index: VideoIndex
     missing: set[int]

@@ -20,11 +20,7 @@ REMEMBERED = 1.5
 
 @dataclass(frozen=True)
 class Pictures:
-    """G pictures of C cameras, sorted by `first`, then camera.
-
-    Image points are normalised and undistorted, NaN for joints not seen. `first` is the first of the
-    three times of the skeleton between which a picture's joints are interpolated.
-    """
+    """G pictures of C cameras, sorted by `first`, the first of the three times around each, then camera."""
 
     first: Int64  # [G]
     camera: Int64  # [G]
