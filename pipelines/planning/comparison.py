@@ -252,10 +252,9 @@ def _difference(
     shared: Bool | None,
 ) -> dict[str, Any]:
     one, other = (results[name] for name in names)
-    tilts, hidden = (
-        [_tilt_deg(scene, each.flight).mean(axis=0) for each in (one, other)],
-        [1.0 - seen[name].mean(axis=(0, 1)) for name in names],
-    )
+    slots = [slot_of(each.flight.position - aimed_at(scene, each.flight)) for each in (one, other)]
+    tilts = [np.degrees(each[..., TILT]).mean(axis=0) for each in slots]
+    hidden = [1.0 - seen[name].mean(axis=(0, 1)) for name in names]
     seed = scene.settings.seed
     measured = one.measured, other.measured
     errors = _NOTHING
@@ -269,10 +268,6 @@ def _difference(
     }
 
 
-def _tilt_deg(scene: ReplayScene, flown: ArmFlight) -> Float:
-    return np.degrees(slot_of(flown.position - aimed_at(scene, flown))[..., TILT])
-
-
 def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]:
     """Judge by each decisive figure if one arm is better (1) or worse (-1) than another, or neither (0).
 
@@ -281,15 +276,12 @@ def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]
     found = []
     for name, (smallest, better) in _DECISIVE.items():
         change = difference[name]
-        counts = change is not None and told_apart(change) and abs(change["mean"]) >= smallest
-        found.append(better * int(np.sign(change["mean"])) if counts and change is not None else 0)
+        ends = change and change["interval"]
+        if change is None or not ends or ends[0] <= 0.0 <= ends[1] or abs(change["mean"]) < smallest:
+            found.append(0)
+        else:
+            found.append(better * int(np.sign(change["mean"])))
     return found
-
-
-def told_apart(found: MeanWithInterval) -> bool:
-    """Test if an interval excludes zero; without an interval no difference counts."""
-    ends = found["interval"]
-    return ends is not None and not ends[0] <= 0.0 <= ends[1]
 
 
 def judge(

@@ -534,14 +534,16 @@ class LocalPlanner:
         """
         config = self._config
         times = t_s + config.tuning.waypoint_s * np.arange(1, config.tuning.waypoints + 1, dtype=np.float64)
-        waypoints = np.stack([p.at(np.append(t_s, times))[0] for p in others]) if others else _nobody(times)
+        waypoints = np.empty((len(others), len(times) + 1, 3))
+        for k, other in enumerate(others):
+            waypoints[k] = other.at(np.append(t_s, times))[0]
         guess = slots if previous is None else previous.at(times)[0]
         path, cost = self._descended(position, velocity, guess, slots, actor, waypoints, field)
         if previous is not None and np.linalg.norm(path[-1] - slots[-1]) > ASTRAY_M:
             # Caught behind something: descend once more from the slots, and take the better result.
-            other = self._descended(position, velocity, slots, slots, actor, waypoints, field)
-            if other[1] < cost:
-                path = other[0]
+            another = self._descended(position, velocity, slots, slots, actor, waypoints, field)
+            if another[1] < cost:
+                path = another[0]
         return DronePlan(t_s, path[2:].copy(), velocity.copy(), config.tuning.waypoint_s)
 
     def _descended(
@@ -597,7 +599,3 @@ def _with_start(position: Float, velocity: Float, waypoints: Float, step_s: floa
     """Return [N + 3, 3]: past and present positions at the drone's velocity, and the waypoints."""
     back = np.array([-2.0, -1.0, 0.0])[:, None] * step_s
     return np.concatenate([position + back * velocity, waypoints])
-
-
-def _nobody(times: Float) -> Float:
-    return np.empty((0, len(times) + 1, 3))

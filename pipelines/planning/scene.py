@@ -402,7 +402,8 @@ def _cameras(
                 noise=noise,
             )
         )
-    return tuple(cameras), "truth" if true_poses else "log", _said_by(stating)
+    said_by = "nobody" if "nobody" in stating else ", ".join(sorted(stating))
+    return tuple(cameras), "truth" if true_poses else "log", said_by
 
 
 def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:
@@ -437,10 +438,6 @@ def _noise(
         white = White(position_m=sigma[0], rotation_deg=float(np.degrees(sigma[1])))
         return (white,), "the logs' covariances, as white noise"
     return (), "still cameras are exact" if entry.poses.static else "nobody"
-
-
-def _said_by(stating: set[str]) -> str:
-    return "nobody" if "nobody" in stating else ", ".join(sorted(stating))
 
 
 def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:

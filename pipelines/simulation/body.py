@@ -225,8 +225,8 @@ def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
     """Put clothes, shoes and hair on a body; hair stands `hair_m` off the scalp on a body of 1.75 m."""
     unit = body.height_m / _USUAL_HEIGHT_M
     waist = body.joint[BONE["pelvis"], 2] + 0.02 * unit
-    quads = body.quads[body.part[body.quads].min(axis=1) != PARTS.index("cloth")]
-    skin, suit = _with_values(body, triangles(quads)), _suit(body)
+    is_cloth = body.part[body.quads].min(axis=1) == PARTS.index("cloth")
+    skin, suit = (_with_values(body, triangles(body.quads[part])) for part in (~is_cloth, is_cloth))
 
     arm, leg, above = suit.values["arm"], suit.values["leg"], suit.values["place"][:, 2]
     shirt = cut(suit, np.minimum(outfit.sleeve - arm, above - waist + 0.08 * unit))
@@ -250,11 +250,6 @@ def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
 
 
 # --- the patches that all is cut from ------------------------------------------------------------------
-
-
-def _suit(body: Undressed) -> Patch:
-    quads = body.quads[body.part[body.quads].min(axis=1) == PARTS.index("cloth")]
-    return _with_values(body, triangles(quads))
 
 
 def _with_values(body: Undressed, faces: NDArray[np.intp]) -> Patch:
@@ -478,14 +473,10 @@ def _measured(skinning: Skinning, skin: Skin, dressed: Dressed, strip_m: float) 
         under = points[dressed.sole & (points[:, 1] * sign > 0)] - joint
         toes = offset[BONE[f"{side}_toes"], 0]
         places = (under[:, 0].min(), toes, under[:, 0].max())
-        soles.append([_sole_at(under, x, strip_m) for x in places])
-    return Rig(offset, np.array(soles))
-
-
-def _sole_at(under: Float, x: float, strip_m: float) -> Float:
-    """Find the middle of a sole [N, 3] m across the foot, `x` ahead of its joint."""
-    near = under[np.abs(under[:, 0] - x) < strip_m]
-    return np.array([x, (near[:, 1].min() + near[:, 1].max()) / 2, under[:, 2].min()])
+        for x in places:  # the middle of the sole across the foot
+            near = under[np.abs(under[:, 0] - x) < strip_m]
+            soles.append([x, (near[:, 1].min() + near[:, 1].max()) / 2, under[:, 2].min()])
+    return Rig(offset, np.array(soles).reshape(2, 3, 3))
 
 
 # --- keypoints -----------------------------------------------------------------------------------------

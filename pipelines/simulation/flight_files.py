@@ -70,14 +70,12 @@ def write_joints(
 def write_alphapose(path: Path, people: Iterable[TrackedKeypoints]) -> None:
     """Write keypoints as AlphaPose does with its tracker; frame k is picture `00000k.jpg`, missed is 0."""
     entries = [
-        (frame, _alphapose_entry(frame, person)) for person in people for frame in _frames_with(person)
+        (frame, _alphapose_entry(frame, person))
+        for person in people
+        for frame in np.flatnonzero(np.isfinite(person.xy).all(axis=-1).any(axis=-1)).tolist()
     ]
     entries.sort(key=lambda pair: pair[0])
     write_lines(path, ["[", ",\n".join(json.dumps(e, separators=(",", ":")) for _, e in entries), "]"])
-
-
-def _frames_with(person: TrackedKeypoints) -> list[int]:
-    return np.flatnonzero(np.isfinite(person.xy).all(axis=-1).any(axis=-1)).tolist()
 
 
 def _alphapose_entry(frame: int, person: TrackedKeypoints) -> dict[str, object]:

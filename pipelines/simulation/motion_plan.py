@@ -259,11 +259,8 @@ class Way:
         )
 
 
-@dataclass(frozen=True)
-class Pace:
-    """Speeds over time, as knots: time in s from the start, speed in m/s, share of running."""
-
-    knots: tuple[tuple[float, float, float], ...]
+Pace = list[tuple[float, float, float]]
+"""Speeds over time, as knots: time in s from the start, speed in m/s, share of running."""
 
 
 def pace(parts: Sequence[WayPart]) -> Pace:
@@ -286,7 +283,7 @@ def pace(parts: Sequence[WayPart]) -> Pace:
         ):
             if duration_s > 1e-6:
                 knots.append((knots[-1][0] + duration_s, speed, part.run))
-    return Pace(tuple(knots))
+    return knots
 
 
 # Keys closer than this count as one moment, so that no curve jumps.
@@ -480,8 +477,8 @@ class Plan:
 
     def travel(self, parts: Sequence[WayPart]) -> None:
         """Travel from a stand to a stand."""
-        knots = pace(parts).knots
-        stretch = self._along(parts, Pace(knots))
+        knots = pace(parts)
+        stretch = self._along(parts, knots)
         self._step_through(stretch, knots, first=RIGHT)
 
     def run_up(self, parts: Sequence[WayPart], speeds: Pace, plant_s: float, foot: int) -> None:
@@ -490,7 +487,7 @@ class Plan:
         The caller plans the rest of the steps and sets the time.
         """
         stretch = self._along(parts, speeds)
-        knots = [knot for knot in speeds.knots if knot[0] <= plant_s + 1e-9]
+        knots = [knot for knot in speeds if knot[0] <= plant_s + 1e-9]
         count = max(2, round(float(self._phase(knots, 0.0)(np.array(plant_s)))))
         first = foot if count % 2 else 1 - foot
         self._walk_steps(stretch, knots, first, count)
@@ -504,7 +501,7 @@ class Plan:
     def _along(self, parts: Sequence[WayPart], speeds: Pace) -> Stretch:
         from scipy.interpolate import CubicHermiteSpline
 
-        times, values, run = np.array(speeds.knots).T
+        times, values, run = np.array(speeds).T
         along = CubicHermiteSpline(times, values, np.zeros_like(values)).antiderivative()
         way = Way(self.place, parts)
         for name, curve in (("speed", values), ("run", run)):

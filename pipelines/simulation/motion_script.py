@@ -17,7 +17,6 @@ from pipelines.simulation.motion_plan import (
     WALK_SPEED_MPS,
     Footstep,
     Keys,
-    Pace,
     Plan,
     Roll,
     Swing,
@@ -584,7 +583,7 @@ def kick(plan: Plan, side: str, run_up_m: float) -> None:
     beyond_m = speed * ((1 + _SLOWED_TO) * (slow_s - plant_s) + _SLOWED_TO * (stop_s - slow_s)) / 2
     way = WayPart(run_up_m + beyond_m, plan.heading, 0.0, speed, 1.0)
     plant = plan.t_s + plant_s
-    plan.run_up([way], Pace(tuple((t, v, 1.0) for t, v in knots)), plant_s, support)
+    plan.run_up([way], [(t, v, 1.0) for t, v in knots], plant_s, support)
     end = (plan.place, plan.heading)
     plan.step(foot, plant + _LIFT_S, plant + _LAND_S, end, 0.0)
     plan.step(support, plant + _CLOSE_S, plant + _STAND_S, end, 0.0)

@@ -65,7 +65,8 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
         for ours, variants in _SIDED.items():
             free = [named.get((side, v)) for v in variants]
             _take(found, f"{side}_{ours}", [index for index in free if index not in found.values()])
-    missing = [name for name in _essential() if name not in found]
+    essential = ["pelvis", *(f"{side}_{bone}" for side in SIDES for bone in _ESSENTIAL_SIDED)]
+    missing = [name for name in essential if name not in found]
     missing += [
         f"{side}_{below}"
         for side in SIDES
@@ -98,10 +99,6 @@ def _parts_of(name: str) -> tuple[str, str]:
         if joined.startswith(side):
             return side, joined.removeprefix(side)
     return "", joined
-
-
-def _essential() -> list[str]:
-    return ["pelvis", *(f"{side}_{bone}" for side in SIDES for bone in _ESSENTIAL_SIDED)]
 
 
 def _take(found: dict[str, int], ours: str, candidates: list[int | None]) -> None:
@@ -168,7 +165,8 @@ def retarget(
     match = match_bones(source)
     source = _without_first_pose(source)
     rest = _rest_joints(source)
-    scale = _leg_length(rig) / _source_leg_length(rest, match)
+    leg = sum(float(np.linalg.norm(rig.offset[BONE[f"left_{bone}"]])) for bone in ("shank", "foot"))
+    scale = leg / _source_leg_length(rest, match)
     laid = _laid_on(rig, rest, match)
     bones = [match[name] for name in BONES]
 
@@ -209,10 +207,6 @@ def _rest_joints(source: SkeletalMotion) -> Float:
         if parent >= 0:
             joints[bone] = joints[parent] + source.offset[bone]
     return joints
-
-
-def _leg_length(rig: Rig) -> float:
-    return sum(float(np.linalg.norm(rig.offset[BONE[f"left_{bone}"]])) for bone in ("shank", "foot"))
 
 
 def _source_leg_length(rest: Float, match: dict[str, int]) -> float:

@@ -41,7 +41,7 @@ from pipelines.geometry.clocks import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, LoggedMap, LogSource, Manifest, MapSource
 from pipelines.session.recognition import recognise
-from pipelines.session.records import IntrinsicsSample, Message, Occupancy, PictureSample, Trajectory
+from pipelines.session.records import IntrinsicsSample, Message, PictureSample, Trajectory
 from pipelines.session.registries import Log, LogFormat
 from pipelines.session.urls import located
 from pipelines.sources.world import in_enu, in_world, world_times
@@ -373,7 +373,7 @@ def maps_of_log(
     from_ns = world_times(settings.clock, found.from_ns, started_ns)
     return replace(
         found,
-        maps=_at_times(found.maps, from_ns),
+        maps=(replace(each, from_ns=since) for each, since in zip(found.maps, from_ns.tolist(), strict=True)),
         from_ns=from_ns,
         dropped=dict(Counter(found.dropped) + Counter(lost)),
     )
@@ -386,8 +386,3 @@ def _poses_taken(flight: Manifest, logs: FlightLogs, log: str) -> list[tuple[str
     taken += [(actor.file, actor.topic, None) for actor in flight.logged_people.values()]
     paths = logs.paths(log)
     return [(topic, parent) for name, topic, parent in taken if logs.paths(name) == paths]
-
-
-def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:
-    for occupancy, since_ns in zip(maps, from_ns.tolist(), strict=True):
-        yield replace(occupancy, from_ns=since_ns)
