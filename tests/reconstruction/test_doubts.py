@@ -127,13 +127,12 @@ CASES: dict[str, tuple[str, Change]] = {
     "mirrored": ("mirrored", with_keypoints(mirrored)),
     "from below": ("mirrored", with_keypoints(from_below)),
     "gimbal": ("gimbal", fixed_gimbal(-DOWN_DEG, "world")),
-    "clock": ("clock", of_cameras(clock(0.3), "drone1")),
+    "clock": ("clock", of_cameras(clock(0.1), "drone3")),
     "heading": ("pose", of_poses(heading(8), "drone1")),
     "rate": ("frame_rate", of_cameras(rate(25), "drone1")),  # the rays tell it, the score hardly
     "rate of all": ("frame_rate", of_cameras(rate(25))),  # the pictures outlast the logs
     "feet": ("unit", of_poses(lambda pose: (pose[0] / 0.3048, pose[1]))),
 }
-
 
 MENDED = ("videos", "rolled", "mirrored", "from below", "gimbal", "feet")
 
@@ -141,7 +140,8 @@ MENDED = ("videos", "rolled", "mirrored", "from below", "gimbal", "feet")
 @pytest.mark.parametrize("case", sorted(set(CASES) - set(MENDED)))
 def test_the_mistake_is_named_first(flight: Described, case: str) -> None:
     code, change = CASES[case]
-    assert doubts_of(mistaken(flight, change))[0]["code"] == code
+    first = doubts_of(mistaken(flight, change))[0]
+    assert (first["code"], case != "clock" or first["cameras"]) == (code, case != "clock" or ["drone3"])
 
 
 @pytest.mark.parametrize(("late", "named"), [(["drone1"], 1), (["drone1", "drone2", "drone3"], 3)])

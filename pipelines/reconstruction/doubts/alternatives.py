@@ -44,6 +44,9 @@ PRICE_OF_ALL = 0.5
 PRICE_OF_ONE = 0.8
 """Price of an alternative of one camera, of which there are as many as cameras."""
 
+LEAST_SIGMAS = 5.0
+"""What is stated is questioned beyond so many of its standard deviations: errors have heavy tails."""
+
 _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _FLU_FROM_FRD = np.diag([1.0, -1, -1])
@@ -56,8 +59,6 @@ _USUAL_RATES_HZ, _SAME_RATE = (24.0, 25.0, 30.0, 50.0, 60.0), 2e-3
 _PRICE_OF_UNUSUAL_RATE = 1.0
 # Logs go on about as long as pictures: a rate pays this, times the share of logs that it leaves unfilmed.
 _PRICE_OF_UNFILMED = 3.0
-# A stated error is questioned beyond so many of its standard deviations: errors have heavy tails.
-_LEAST_SIGMAS = 5.0
 # A fitted number that is nearer to zero, in its own standard deviations, may be zero.
 _LEAST_OWN_SIGMAS = 3.0
 # Smaller faults do not matter beside the errors of good poses, whatever is stated of these.
@@ -677,12 +678,17 @@ def numbers_of_one(trial: Trial) -> Iterator[Numbers]:
 
 def _matters(trial: Trial, kind: str, group: Sequence[int], numbers: Float) -> bool:
     """Test if numbers are beyond what is stated of the errors of the poses, and large enough to matter."""
-    position_m, rotation_rad = _LEAST_SIGMAS * trial.described.sigma[list(group), :2].max(axis=0)
+    position_m, rotation_rad = LEAST_SIGMAS * trial.described.sigma[list(group), :2].max(axis=0)
     if kind == "focal":
         return abs(float(numbers[0])) >= _LEAST_ZOOM
     shift_m = float(np.linalg.norm(numbers[:3])) if NUMBERS[kind] >= 3 else 0.0
     turn_rad = abs(float(numbers[-1])) if kind != "shift" else 0.0
     return bool(shift_m >= max(position_m, _LEAST_SHIFT_M) or turn_rad >= max(rotation_rad, _LEAST_TURN_RAD))
+
+
+def _is_sure(numbers: Float, covariance: Float) -> bool:
+    """Test if fitted numbers differ from zero, by their own covariance."""
+    return float(numbers @ np.linalg.pinv(covariance) @ numbers) > _LEAST_OWN_SIGMAS**2
 
 
 def _numbers(trial: Trial, kind: str, group: list[int]) -> Numbers:
@@ -701,8 +707,7 @@ def _of_numbers(
     trial: Trial, kind: str, group: list[int], numbers: Float, covariance: Float
 ) -> Alternative | None:
     """State fitted numbers and their remedy; None if they are too small to matter."""
-    sure = float(numbers @ np.linalg.pinv(covariance) @ numbers) > _LEAST_OWN_SIGMAS**2
-    if not sure or not _matters(trial, kind, group, numbers):
+    if not _is_sure(numbers, covariance) or not _matters(trial, kind, group, numbers):
         return None
     cameras, whose, number = trial.cameras, trial.whose(group), float(numbers[-1])
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
@@ -764,7 +769,10 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
         position[moved] += numbers.reshape(-1, 1, 3)
         return replace(scene, position=position)
 
-    def said(numbers: Float, covariance: Float) -> Alternative:
+    def said(numbers: Float, covariance: Float) -> Alternative | None:
+        matters = all(_matters(trial, "shift", moved, shift) for shift in numbers.reshape(-1, 3))
+        if not matters or not _is_sure(numbers, covariance):
+            return None
         shifts = np.zeros((len(trial.names), 3))
         shifts[moved] = numbers.reshape(-1, 3)
         sigma_m = np.sqrt(np.diag(covariance).reshape(-1, 3).sum(axis=1)).max() if covariance.size else 0.0

@@ -17,7 +17,14 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.reconstruction.doubts import alternatives, remedies
-from pipelines.reconstruction.doubts.alternatives import PRICE_OF_ALL, RATES, Alternative, Numbers, Trial
+from pipelines.reconstruction.doubts.alternatives import (
+    LEAST_SIGMAS,
+    PRICE_OF_ALL,
+    RATES,
+    Alternative,
+    Numbers,
+    Trial,
+)
 from pipelines.reconstruction.doubts.logs import doubts_of_logs
 from pipelines.reconstruction.doubts.scene import (
     JOINTS,
@@ -103,6 +110,10 @@ _CLOCK_STEP_S = 0.1
 _LEAST_CLOCK_S = 0.05
 # Beside a clock that scores worse than the stated one by more than this lies no better one.
 _REACH = 1.0
+# Rays of a right flight scatter and miss each other by less, also where a remedy is not exact.
+_MEETING, _LEFT_MISFIT = 0.9, 2.5
+# In this time people and cameras move by more than keypoints err; so far is a clock followed.
+_RAYS_STEP_S, _MOST_STEPS = 0.05, 20
 
 
 def doubts_of(
@@ -208,7 +219,7 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     base, found = base_of(flight, trial.described)
     # A turned world leaves rays and bodies as they are; rolled cameras mirror the body.
     mirrored = any(found.odd[name].sigmas >= STRANGE for name in ("face", "bend") if name in found.odd)
-    fits = found.misfit < MISSED and found.scatter < SCATTERED and not mirrored
+    fits = found.misfit < MISSED and found.scatter < _MEETING and not mirrored
     objective = Objective(trial, base)
     tried: list[Tried | None] = [*_of_logs(objective), *_of_turns(objective, late)]
     strange = _is_strange(found)
@@ -227,13 +238,20 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
         )
     # Times come last, since most of them need no exact score beside what fits by then.
     tried += map(objective.scored, alternatives.rates(trial))
-    tried += [objective.best_clock([index]) for index in trial.every]
+    tried += [
+        each
+        for index in trial.every
+        for each in (objective.best_clock([index]), objective.clock_of_rays(index))
+    ]
     tried += [objective.best_clock(trial.every)] if odd and trial.moving else []
     causes = _causes(objective, [each for each in tried if each is not None], odd)
     if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
         level = alternatives.level(trial, solve(trial.described).joints) if fits else ()
         causes = [Tried(each) for each in level] or causes or _below_zero(objective)
-    doubts = [_doubt(trial, each, found) for each in causes]
+    doubts = [
+        _doubt(trial, each, found, [cause.alternative.code for cause in causes if cause.score])
+        for each in causes
+    ]
     if doubts or strange or base.total >= DOUBTFUL:
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
@@ -264,11 +282,6 @@ class Tried(NamedTuple):
     def total(self) -> float:
         """The score with the price; what is seen directly, without a scene, wins over everything."""
         return -np.inf if self.score is None else self.score.total + self.alternative.price
-
-    @property
-    def is_clock_of_one(self) -> bool:
-        """Test for another clock of one camera."""
-        return self.alternative.code == "clock" and not self.alternative.alike
 
 
 class Compared(NamedTuple):
@@ -344,6 +357,38 @@ class Objective:
             best, late_s = min(beside, key=lambda each: each[0].total)
         return best if abs(late_s) >= _LEAST_CLOCK_S else None
 
+    def clock_of_rays(self, index: int) -> Tried | None:
+        """Follow the chi^2 of the rays downwards from one camera's stated clock; None if that stays.
+
+        Constant errors of all poses are fitted beside it; the score takes them for other clocks. Steps are
+        long, since keypoints err anew in every picture: short ones show that noise alone.
+        """
+        known: dict[int, float] = {}
+
+        def saved(step: int) -> float:
+            if step not in known:
+                scene = self.trial.with_times([index], step * _RAYS_STEP_S)
+                known[step] = self._fit(self._at_moments_of(scene)).cost - self._fit(scene).cost
+            return known[step]
+
+        best = towards = max((0, -1, 1), key=saved)
+        while towards and abs(best) < _MOST_STEPS and saved(best + towards) > saved(best):
+            best += towards
+        bend = 2 * saved(best) - saved(best - 1) - saved(best + 1)
+        if not best or saved(best) < LEAST_SIGMAS**2 or not 0 < bend < np.inf:
+            return None
+        late_s = (best + (saved(best + 1) - saved(best - 1)) / (2 * bend)) * _RAYS_STEP_S
+        scene = self.trial.with_times([index], late_s)
+        surer = float(np.log1p(late_s**2 * bend / 2 / _RAYS_STEP_S**2))
+        cost = self._fit(scene).cost + surer + _OF_ANY_SIZE
+        return self.scored(alternatives.clock(self.trial, [index], late_s), cost)._replace(numbers=1)
+
+    def _at_moments_of(self, scene: SceneOfMoments) -> SceneOfMoments:
+        """Return the description at the moments that a scene shows."""
+        described = self.trial.described
+        seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
+        return replace(described, rays=np.where(seen, described.rays, np.nan))
+
     def with_numbers(self, free: Numbers) -> Tried | None:
         """Fit numbers, from where the rays miss each other least; None if they are too small to matter.
 
@@ -397,8 +442,7 @@ class Objective:
             return Compared(np.inf, -np.inf, np.inf, -np.inf)
         before, total = self.described.cost, self.base.total
         if tried.alternative.code in (*TIMES, "videos_swapped"):
-            seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
-            same = replace(described, rays=np.where(seen, described.rays, np.nan))
+            same = self._at_moments_of(scene)
             before = self._fit(same).cost
             total = min(total, score(self.trial.flight, same, self.base).total)
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
@@ -416,22 +460,9 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tri
     Of each code the one with the fewest numbers is taken; those without one are first. What leaves
     something odd is no cause.
     """
-
-    def without_rays(each: Tried) -> float:
-        scene = each.alternative.scene
-        return each.total + (0.0 if scene is None else surprise(unposed(scene)))
-
-    most = objective.base.total + surprise(unposed(objective.trial.described)) - LEAST_GAIN_OF_TIMES
-    by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=without_rays)
-    # The rays alone may tell the clock of one camera, where the score pays its price.
-    by_score = [
-        each
-        for each in by_score[:_FITTED]
-        if each.alternative.code not in TIMES
-        or without_rays(each) <= most + LEAST_GAIN_OF_TIMES * each.is_clock_of_one
-    ]
+    by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=lambda each: each.total)
     weighed = []
-    for each in [*by_score, *(each for each in tried if np.isfinite(each.cost))]:
+    for each in [*by_score[:_FITTED], *(each for each in tried if np.isfinite(each.cost))]:
         found = objective.compared(each)
         if found.is_enough(each.alternative, odd):
             misfits = (found.score_before + found.rays_before, found.score_after + found.rays_after)
@@ -459,7 +490,9 @@ def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
     if alternative.scene is None:
         return True
     found = score(alternative.flight or flight, alternative.scene)
-    return found.total < DOUBTFUL and not _is_strange(found)
+    meets = found.misfit < _LEFT_MISFIT and found.scatter < _MEETING
+    # Larger errors of poses are no cause that mends the rays.
+    return found.total < DOUBTFUL and (meets or alternative.price == np.inf) and not _is_strange(found)
 
 
 def _below_zero(objective: Objective) -> list[Tried]:
@@ -546,8 +579,10 @@ def _of_logs(objective: Objective) -> list[Tried]:
 # --- what is said -----------------------------------------------------------------------------------------
 
 
-def _doubt(trial: Trial, cause: Tried, described: Score) -> Doubt:
+def _doubt(trial: Trial, cause: Tried, described: Score, codes: Sequence[str]) -> Doubt:
+    """State an alternative; without a remedy, if others of all the `codes` explain the flight as well."""
     alternative = cause.alternative
+    others = " or ".join(f"`{code}`" for code in codes if code != alternative.code)
     evidence = {"residual_px": residuals_px(trial.described)[0], "score": round(described.total, 2)}
     if cause.score is not None and alternative.scene is not None:
         evidence |= {
@@ -564,9 +599,9 @@ def _doubt(trial: Trial, cause: Tried, described: Score) -> Doubt:
     return Doubt(
         code=alternative.code,
         cameras=list(alternative.cameras),
-        what=alternative.what,
+        what=alternative.what + (f" (not sure: {others} explains the flight as well)" if others else ""),
         evidence=told,
-        remedy=alternative.remedy,
+        remedy="" if others else alternative.remedy,
     )
 
 
