@@ -110,6 +110,8 @@ _CLOCK_STEP_S = 0.1
 _LEAST_CLOCK_S = 0.05
 # Beside a clock that scores worse than the stated one by more than this lies no better one.
 _REACH = 1.0
+# A flight is doubted without a cause if some change lowers the objective by so much, and leaves a doubt.
+_WITHOUT_CAUSE = 9.0
 # Rays of a right flight scatter and miss each other by less, also where a remedy is not exact.
 _MEETING, _LEFT_MISFIT = 0.9, 2.5
 # In this time people and cameras move by more than keypoints err; so far is a clock followed.
@@ -244,7 +246,7 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
         for each in (objective.best_clock([index]), objective.clock_of_rays(index))
     ]
     tried += [objective.best_clock(trial.every)] if odd and trial.moving else []
-    causes = _causes(objective, [each for each in tried if each is not None], odd)
+    causes, gained = _causes(objective, [each for each in tried if each is not None], odd)
     if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
         level = alternatives.level(trial, solve(trial.described).joints) if fits else ()
         causes = [Tried(each) for each in level] or causes or _below_zero(objective)
@@ -252,7 +254,7 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
         _doubt(trial, each, found, [cause.alternative.code for cause in causes if cause.score])
         for each in causes
     ]
-    if doubts or strange or base.total >= DOUBTFUL:
+    if doubts or strange or base.total >= DOUBTFUL or gained >= _WITHOUT_CAUSE:
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
         named |= {"clock"} if "frame_rate" in named else set()
@@ -454,11 +456,11 @@ class Objective:
         return Compared(*scores, self._rays(before, described), self._rays(cost, scene))
 
 
-def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tried]:
+def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> tuple[list[Tried], float]:
     """Return the alternatives that lower the objective next to most, one of each code; none if by too little.
 
     Of each code the one with the fewest numbers is taken; those without one are first. What leaves
-    something odd is no cause.
+    something odd is no cause. Also return the most that any alternative lowers the objective by.
     """
     by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=lambda each: each.total)
     weighed = []
@@ -478,7 +480,7 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> list[Tri
     for gain, each in sorted(causes, key=lambda pair: pair[1].numbers):
         simplest.setdefault(each.alternative.code, (gain, each))
     by_gain = sorted(simplest.values(), key=lambda pair: (pair[1].numbers > 0, -pair[0]))
-    return [each for _, each in by_gain]
+    return [each for _, each in by_gain], max((gain for gain, _ in weighed), default=0.0)
 
 
 def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
