@@ -46,6 +46,7 @@ from pipelines.reporting.wording import (
     shortened,
     with_interval,
 )
+from pipelines.session.maps import MapSurface, surface_of
 from pipelines.session.records import Occupancy
 
 # Drones pass obstacles at this distance, so that more of the map would only make the drawing smaller.
@@ -93,15 +94,6 @@ class Heights:
     above_m: Float  # [X, Y], 0 where nothing is occupied
 
 
-@dataclass(frozen=True)
-class RaisedSurface:
-    """The surface of everything that rises above the ground, thinned out."""
-
-    points: Float  # [N, 3] m, world: middles of cubes
-    cube_m: float  # their side
-    voxels: int  # number of surface voxels that they represent
-
-
 def map_around(occupancy: Occupancy, low: Float, high: Float) -> MapAround | None:
     """Cut the columns of a map within a box [2], [2] m; None where nothing is occupied (0.5 and above)."""
     shape = np.array(occupancy.probability.shape[:2])
@@ -142,23 +134,10 @@ def heights(around: MapAround) -> Heights:
     )
 
 
-def surface(around: MapAround, most: int = MAX_SURFACE_POINTS) -> RaisedSurface:
-    """Return voxels with a free neighbour above the ground, in the smallest cubes that leave `most`."""
-    occupied = np.pad(around.occupied, 1)
-    inner = occupied[1:-1, 1:-1, 1:-1].copy()
-    for axis in range(3):
-        for side in (slice(None, -2), slice(2, None)):
-            inner &= occupied[tuple(side if a == axis else slice(1, -1) for a in range(3))]
-    voxels = np.argwhere(around.occupied & ~inner)
-    top_m = around.corner[2] + around.resolution_m * (voxels[:, 2] + 1)
-    voxels = voxels[top_m > around.ground_m + LOWEST_OBSTACLE_M - 1e-9 * around.resolution_m]
-    gathered = 1
-    cubes: Int64 = voxels
-    while len(cubes) > most:
-        gathered += 1
-        cubes = np.unique(voxels // gathered, axis=0)
-    cube_m = around.resolution_m * gathered
-    return RaisedSurface(around.corner + cube_m * (cubes + 0.5), cube_m, len(voxels))
+def raised_surface(around: MapAround, most: int = MAX_SURFACE_POINTS) -> MapSurface:
+    """Return the surface of everything that rises above the ground, in at most so many cubes."""
+    occupancy = Occupancy(around.occupied.astype(np.float32), around.corner, around.resolution_m)
+    return surface_of(occupancy, most, above_m=around.ground_m + LOWEST_OBSTACLE_M)
 
 
 # --- flights ---

@@ -19,7 +19,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.body_model import ABOVE, BELOW, body_model
 from pipelines.geometry.poses import multiply
 from pipelines.geometry.rig import BONES
-from pipelines.reporting.arms import ArmTrack, RaisedSurface, Replan, surface
+from pipelines.reporting.arms import ArmTrack, Replan, raised_surface
 from pipelines.reporting.content import (
     FULL_SCALE,
     MeasuredMotion,
@@ -32,6 +32,7 @@ from pipelines.reporting.content import (
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
+from pipelines.session.maps import MapSurface
 from pipelines.session.people import DERIVED, bones_of
 from pipelines.session.records import MovingBody, Trajectory
 from pipelines.session.tables import trajectory_from
@@ -113,9 +114,9 @@ def make_scene(
         data["body"] = body.packed(kept, origin) | {"names": list(summary.people)}
         if bodies:
             data["skin"] = _packed_skin(bodies, t_ns, body.middle[kept])
-    around = surface(replan.around) if replan is not None and replan.around is not None else None
+    around = raised_surface(replan.around) if replan is not None and replan.around is not None else None
     if around is not None and around.voxels:
-        points = _packed(1000 * (around.points - origin), np.int32)
+        points = _packed(1000 * (around.middle - origin), np.int32)
         data["surface"] = {"cube": around.cube_m, "points": points}
     if body is not None and strips:
         data["film"] = [_packed_strip(strip, summary.origin_ns, origin) for strip in strips]
@@ -133,7 +134,7 @@ def make_scene(
 
 
 def _notes(
-    every: int, times: int, body: _PackedBody | None, around: RaisedSurface | None, strips: Sequence[Strip]
+    every: int, times: int, body: _PackedBody | None, around: MapSurface | None, strips: Sequence[Strip]
 ) -> list[str]:
     notes = []
     if every > 1:
@@ -148,7 +149,7 @@ def _notes(
     if around is not None and around.voxels:
         notes.append(
             f"The map: {plural(around.voxels, 'voxel')} of the surface above the ground, drawn as "
-            f"{plural(len(around.points), 'cube')} of {quantity(around.cube_m, 'm', 2)}."
+            f"{plural(len(around.middle), 'cube')} of {quantity(around.cube_m, 'm', 2)}."
         )
     return notes
 

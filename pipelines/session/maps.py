@@ -12,6 +12,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -212,3 +213,28 @@ def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
     with archive.open(f"{name}.npy") as file:
         array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
     return array
+
+
+@dataclass(frozen=True)
+class MapSurface:
+    """N cubes of whole voxels that cover the surface of a map."""
+
+    middle: Float  # [N, 3] m, world
+    cube_m: float  # their side
+    voxels: int  # of the map's surface
+
+
+def surface_of(occupancy: Occupancy, most: int, *, above_m: float = -math.inf) -> MapSurface:
+    """Find occupied voxels with a free neighbour that rise above a height, in at most so many cubes."""
+    from scipy.ndimage import binary_erosion
+
+    occupied = occupancy.probability >= 0.5  # False where nothing is known
+    voxels = np.argwhere(occupied & ~binary_erosion(occupied))
+    top_m = occupancy.origin[2] + occupancy.resolution_m * (voxels[:, 2] + 1)
+    voxels = voxels[top_m > above_m - 1e-9 * occupancy.resolution_m]
+    gathered, cubes = 1, voxels
+    while len(cubes) > most:
+        gathered += 1
+        cubes = np.unique(voxels // gathered, axis=0)
+    cube_m = occupancy.resolution_m * gathered
+    return MapSurface(occupancy.origin + cube_m * (cubes + 0.5), cube_m, len(voxels))

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.formats import poses as trajectory_files
 from pipelines.formats.scenes import mcap_writing
-from pipelines.formats.skeletons import bvh, joint_files, trc
+from pipelines.formats.skeletons import joint_files, trc
 from pipelines.session.registries import Export
 from tests.formats.calibrations import (
     test_anipose_toml,
@@ -129,7 +129,6 @@ SEEDS: dict[str, Writer] = {
     "anipose": _text("calib.toml", test_anipose_toml.CAMERA),
     "ardupilot": lambda folder: drone_logs.write_dataflash(folder / "a.bin", _truth(folder)),
     "bvh": _text("a.bvh", test_bvh.TEXT),
-    "bvh of ours": _export(bvh.EXPORT),
     "c3d": lambda folder: test_c3d.write(folder / "a.c3d", walking(12)),
     "camera_info": lambda folder: test_ros_camera_info.stored(folder / "left.yaml"),
     "camera_info as ini": _text("left.ini", test_ros_camera_info.INI),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipelines.reporting import viewer
-from pipelines.reporting.arms import MapAround, Replan, heights, map_around, summarise_replan, surface
+from pipelines.reporting.arms import MapAround, Replan, heights, map_around, raised_surface, summarise_replan
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.summary import summarise
 from pipelines.reporting.viewer import ViewerScene, make_scene
@@ -117,18 +117,18 @@ def test_heights_count_from_the_ground() -> None:
 
 def test_the_surface_is_the_shell_of_what_rises() -> None:
     terrain = _around(make_map(), (-100.0, -100.0), (100.0, 100.0))
-    found = surface(terrain)
+    found = raised_surface(terrain)
     # Layer 0 is ground. Of 8 x 6 columns eight layers show their 24 edge voxels, the last one all 48.
-    assert found.voxels == len(found.points) == 8 * 24 + 48
+    assert found.voxels == len(found.middle) == 8 * 24 + 48
     assert found.cube_m == 0.5
-    assert found.points.min(axis=0).tolist() == [-9.75, 0.25, 0.75]
-    assert found.points.max(axis=0).tolist() == [-6.25, 2.75, 4.75]
-    thin = surface(terrain, most=100)
+    assert found.middle.min(axis=0).tolist() == [-9.75, 0.25, 0.75]
+    assert found.middle.max(axis=0).tolist() == [-6.25, 2.75, 4.75]
+    thin = raised_surface(terrain, most=100)
     assert thin.voxels == 240
-    assert len(thin.points) <= 100
+    assert len(thin.middle) <= 100
     assert thin.cube_m == 1.0
     # Every voxel lies in one of the cubes.
-    offset = np.abs(found.points[:, None] - thin.points[None]).max(axis=-1)
+    offset = np.abs(found.middle[:, None] - thin.middle[None]).max(axis=-1)
     assert (offset.min(axis=1) < thin.cube_m / 2).all()
 
 

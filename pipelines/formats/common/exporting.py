@@ -1,7 +1,6 @@
 """Parts that exports share: names of files, tables, chosen times, maps and covariances for viewers."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
+from pipelines.session.maps import MapSurface, surface_of
 from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory
 
 CHI2_95 = 7.815
@@ -49,6 +49,12 @@ def file_names_of_people(recording: Recording, people: int) -> list[str]:
     return names
 
 
+def no_body(recording: Recording) -> DataError:
+    """Make the error of a recording in which nobody has a body."""
+    remedy = "run `mocap reconstruct`; a body needs hips, shoulders and ten landmarks of a person"
+    return DataError(recording.name, "holds no body to export", remedy, code="no-body")
+
+
 def tracks_of(recording: Recording) -> dict[str, Trajectory]:
     """Return the cameras' poses by file name: `<camera>` as logged, `<camera>_refined` as corrected."""
     tracks = dict(recording.cameras)
@@ -80,38 +86,15 @@ def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:
     return half, turn
 
 
-@dataclass(frozen=True)
-class MapSurface:
-    """N cubes that cover the surface."""
-
-    middle: Float  # [N, 3] m, world
-    cube_m: float  # their side
-    voxels: int  # of the map's surface
-
-
 def shown_surface(recording: Recording, occupancy: Occupancy, export: str) -> MapSurface:
     """Find the surface of a map of the recording; note if its voxels are gathered in larger cubes."""
-    surface = surface_of(occupancy)
+    surface = surface_of(occupancy, MOST_CUBES)
     if surface.cube_m > occupancy.resolution_m * 1.001:
         recording.progress.note(
             f"{export}: the map's {surface.voxels} surface voxels are gathered in cubes of "
             f"{surface.cube_m:g} m, {len(surface.middle)} of them"
         )
     return surface
-
-
-def surface_of(occupancy: Occupancy) -> MapSurface:
-    """Find the surface of a map in at most `MOST_CUBES` cubes of whole voxels; unknown is not occupied."""
-    from scipy.ndimage import binary_erosion
-
-    occupied = occupancy.probability >= 0.5  # False where nothing is known
-    voxels = np.argwhere(occupied & ~binary_erosion(occupied))
-    gathered, cubes = 1, voxels
-    while len(cubes) > MOST_CUBES:
-        gathered += 1
-        cubes = np.unique(voxels // gathered, axis=0)
-    cube_m = occupancy.resolution_m * gathered
-    return MapSurface(occupancy.origin + cube_m * (cubes + 0.5), cube_m, len(voxels))
 
 
 def thinned(t_ns: Int64, rate_hz: float) -> Int64:

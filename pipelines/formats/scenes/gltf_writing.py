@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.exporting import safe_file_name, thinned
-from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.formats.common.exporting import no_body, safe_file_name, thinned
+from pipelines.geometry.arrays import Float, Int64, Intrinsics, nearest_rows
 from pipelines.geometry.body_model import body_model
 from pipelines.geometry.poses import continuous_signs, multiply
 from pipelines.session.errors import DataError
@@ -108,10 +108,7 @@ def _add_person(
 
 
 def _add_camera(asset: GltfAsset, name: str, track: Trajectory, lens: Intrinsics, t_ns: Int64) -> None:
-    after = np.clip(np.searchsorted(track.t_ns, t_ns), 0, len(track.t_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    is_before = np.abs(track.t_ns[before] - t_ns) < np.abs(track.t_ns[after] - t_ns)
-    nearest = np.where(is_before, before, after)
+    nearest = nearest_rows(track.t_ns, t_ns)
     x, y, z = track.position[nearest].T
     turn = multiply(multiply(FROM_WORLD, track.quaternion_xyzw[nearest]), _AHEAD)
     camera = {
@@ -276,8 +273,7 @@ class MeshExport:
         """Write the bodies at the times of the skeleton."""
         bodies = recording.bodies()
         if recording.motion is None or not bodies:
-            remedy = "run `mocap reconstruct`; a body needs hips, shoulders and ten landmarks of a person"
-            raise DataError(recording.name, "holds no body to export", remedy, code="no-body")
+            raise no_body(recording)
         motion_ns = recording.motion.t_ns
         t_ns = motion_ns[thinned(motion_ns, KEY_FRAMES_HZ)]
         if len(t_ns) < len(motion_ns):

@@ -8,17 +8,10 @@ they are zero throughout. The file states neither unit nor axes. A y-up file's (
 (z, x, y).
 
 The export is the rig of the person's body, at rest upright with hanging arms: its centres of joints were a
-third nearer to the true ones than landmarks on the tuning flights, and it shows how limbs twist. A person
-without a body, or whose body is known less often than the hips, gets bones of their median measured lengths.
-At rest that body stands in a T, facing +x with the left towards +y (in a y-up file +z and +x). Rotations
-follow in closed form. The left axis of the hips is the line between them, and their up axis is as near to the
-neck as that allows. The spine, at the same place, points to the neck, its left axis as near to the line
-between the shoulders as that allows. Every other bone points to its next joint by the smallest turn from its
-parent's direction: positions show no twist.
+third nearer to the true ones than landmarks on the tuning flights, and it shows how limbs twist.
 
-BVH cannot mark missing values. Times before the first and after the last known hips are left out. In between,
-unknown hips keep their last position, and a bone with a missing end its last rotation. All of this is
-counted.
+BVH cannot mark missing values. Times before the first and after the last known body are left out; in between
+it keeps its last pose. Both are counted.
 """
 
 from __future__ import annotations
@@ -29,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.exporting import people_of
+from pipelines.formats.common.exporting import no_body, people_of
 from pipelines.formats.common.files import read_head
 from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints, describe_motion
 from pipelines.geometry.arrays import Bool, Float, Int64
@@ -38,12 +31,10 @@ from pipelines.geometry.poses import (
     interpolate_poses,
     matrix_from_quaternion,
     multiply,
-    quaternion_from_matrix,
     rotate,
 )
 from pipelines.geometry.rig import BONE, BONES, PARENT
 from pipelines.session.errors import DataError
-from pipelines.session.people import take_joints, with_derived
 from pipelines.session.records import JointMotion, MovingBody, Recording, SkeletalMotion
 from pipelines.session.storage import bad_value, damaged, empty, read_text
 
@@ -348,52 +339,32 @@ _IN_FILE = {"y-up": [1, 2, 0], "z-up": [0, 1, 2]}  # indices of the world's axes
 _DECIMALS = 6
 # Below this cosine of the middle angle the outer two turn about one axis (gimbal lock).
 _LOCKED = 1e-7
-_AHEAD_UP = (0.5, 0.0, np.sqrt(0.75))
-_AHEAD_DOWN = (np.sqrt(0.75), 0.0, -0.5)
-_LEFT, _RIGHT, _DOWN, _UP, _HERE = (0, 1, 0), (0, -1, 0), (0, 0, -1), (0, 0, 1), (0, 0, 0)
-_MUST = ("left_hip", "right_hip", "neck")
 
 
 class BvhExport:
     """Writer of `<name>.bvh`, or `<name>_<person>.bvh` for each of several; by default cm and y up."""
 
     name = "bvh"
-    title = "a rig of constant bones that follows the skeleton, for Blender"
+    title = "the rig of each person's body, bones of constant length, for Blender"
     choices: Mapping[str, tuple[str, ...]] = {"unit": ("cm", "m", "mm", "inch"), "axes": ("y-up", "z-up")}
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person to whom a rig can be fitted; a note gives the reason for each other one."""
+        """Write every person who has a body; a note says what was left out or held."""
         motion, files = people_of(recording, folder, ".bvh")
-        even = at_even_times("bvh", motion, recording.progress)
-        bodies = {body.person: body for body in recording.bodies()}
-        written, refused = [], None
-        for person, path in files.items():
-            try:
-                rigs = [fit_rig(path.name, even.motion, person)]
-                if person in bodies:
-                    rigs.insert(0, rig_of_body(bodies[person], even.motion.t_ns))
-                rigged = max(rigs, key=lambda rig: len(rig.motion.t_s) - rig.without_hips)
-            except DataError as error:
-                refused = error
-                recording.progress.note(str(error))
-                continue
-            write_motion(path, rigged.motion, unit=recording.unit or "cm", axes=recording.axes or "y-up")
-            recording.progress.note(_made_up(path.name, rigged, len(even.motion.t_ns)))
-            written.append(path)
-        if refused is not None and not written:
-            raise refused
-        return sorted(written)
-
-
-def _made_up(name: str, rigged: Rigged, frames: int) -> str:
-    """Report the parts of the file that were not measured."""
-    kept = len(rigged.motion.t_s)
-    parts = [f"{name}: BVH has no word for missing"]
-    if frames > kept:
-        parts.append(f"{frames - kept} of {frames} frames before and after the hips are seen were left out")
-    parts.append(f"the hips stay where they were in {rigged.without_hips} of {kept} frames")
-    parts.append(f"{rigged.turns_held} of {rigged.turns} turns of bones are held")
-    return "; ".join(parts)
+        bodies = [body for body in recording.bodies() if body.person in files]
+        if not bodies:
+            raise no_body(recording)
+        t_ns = at_even_times("bvh", motion, recording.progress).motion.t_ns
+        for body in bodies:
+            path = files[body.person]
+            rig, held = rig_of_body(body, t_ns)
+            write_motion(path, rig, unit=recording.unit or "cm", axes=recording.axes or "y-up")
+            frames = len(rig.t_s)
+            recording.progress.note(
+                f"{path.name}: {len(t_ns) - frames} of {len(t_ns)} frames before and after the body is known"
+                f" were left out; it keeps its last pose in {held} of {frames} frames"
+            )
+        return sorted(files[body.person] for body in bodies)
 
 
 def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) -> None:
@@ -455,88 +426,6 @@ def _as_text(values: Float) -> str:
     return " ".join(f"{value:.{_DECIMALS}f}" for value in (np.round(values, _DECIMALS) + 0.0).tolist())
 
 
-@dataclass(frozen=True)
-class _RigBone:
-    """Bone as files name it, with its first joint, and that joint's direction at rest from its parent's."""
-
-    name: str
-    parent: str | None
-    joint: str
-    rest: tuple[float, float, float]
-
-
-def _arm(side: str, out: tuple[float, float, float]) -> tuple[_RigBone, ...]:
-    word = side.capitalize()
-    return (
-        _RigBone(f"{word}Shoulder", "Spine", "neck", _UP),
-        _RigBone(f"{word}Arm", f"{word}Shoulder", f"{side}_shoulder", out),
-        _RigBone(f"{word}ForeArm", f"{word}Arm", f"{side}_elbow", out),
-        _RigBone(f"{word}Hand", f"{word}ForeArm", f"{side}_wrist", out),
-    )
-
-
-def _leg(side: str, out: tuple[float, float, float]) -> tuple[_RigBone, ...]:
-    word = side.capitalize()
-    return (
-        _RigBone(f"{word}UpLeg", "Hips", f"{side}_hip", out),
-        _RigBone(f"{word}Leg", f"{word}UpLeg", f"{side}_knee", _DOWN),
-        _RigBone(f"{word}Foot", f"{word}Leg", f"{side}_ankle", _DOWN),
-        _RigBone(f"{word}ToeBase", f"{word}Foot", f"{side}_big_toe", _AHEAD_DOWN),
-    )
-
-
-_TRUNK = (
-    _RigBone("Hips", None, "hip", _HERE),
-    _RigBone("Spine", "Hips", "hip", _HERE),
-    _RigBone("Neck", "Spine", "neck", _UP),
-)
-_HEADS = (_RigBone("Head", "Neck", "head", _UP), _RigBone("Head", "Neck", "nose", _AHEAD_UP))
-_LIMBS = (*_arm("left", _LEFT), *_arm("right", _RIGHT), *_leg("left", _LEFT), *_leg("right", _RIGHT))
-
-
-@dataclass(frozen=True)
-class Rigged:
-    """Motion on a rig, with counts of the values that were filled in."""
-
-    motion: SkeletalMotion
-    joints: tuple[str, ...]  # the joint at which each bone begins
-    first: int  # index of the first frame; those before it are left out
-    without_hips: int  # frames in which the hips keep their last position
-    turns_held: int  # rotations of bones that are kept from a frame before (or after)
-    turns: int  # number of all rotations
-
-
-def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
-    """Fit a rig to one person's joints at a constant rate; `source` is the name for messages."""
-    joints, position = with_derived(motion.joints, motion.position[:, person])
-    middle = take_joints(position, joints, ("left_hip", "right_hip")).mean(axis=1)
-    place = {joint: position[:, k] for k, joint in enumerate(joints)} | {"hip": middle}
-    seen = np.flatnonzero(np.isfinite(middle).all(axis=1))
-    lacking = [joint for joint in _MUST if joint not in place]
-    whole = not lacking and any(np.isfinite(place["neck"][seen]).all(axis=1))
-    if not whole:
-        lack = f"lacks {', '.join(lacking)}" if lacking else "never shows hips and neck at one time"
-        raise DataError(source, f"{lack}: no rig can be fitted", "use a skeleton with hips and shoulders")
-    span = slice(int(seen[0]), int(seen[-1]) + 1)
-    place = {joint: points[span] for joint, points in place.items()}
-    bones, lengths = _rig_bones(place)
-    index = {bone.name: k for k, bone in enumerate(bones)}
-    parent = tuple(-1 if bone.parent is None else index[bone.parent] for bone in bones)
-    offset = np.array([np.array(bone.rest) * length for bone, length in zip(bones, lengths, strict=True)])
-    rotation, held = _turns(bones, parent, place)
-    root, without_hips = _held(place["hip"])
-    skeletal = SkeletalMotion(
-        t_s=(motion.t_ns[span] - motion.t_ns[span][0]) / 1e9,
-        bones=tuple(bone.name for bone in bones),
-        parent=parent,
-        offset=offset,
-        end={},
-        root=root,
-        rotation=rotation,
-    )
-    return Rigged(skeletal, tuple(bone.joint for bone in bones), int(seen[0]), int(without_hips.sum()), *held)
-
-
 _OF_BODY = {
     "pelvis": "Hips",
     "spine": "Spine",
@@ -555,9 +444,10 @@ _OF_BODY = {
 }
 
 
-def rig_of_body(body: MovingBody, t_ns: Int64) -> Rigged:
-    """Take a body, which is known at one time at least, as a rig at given times [T]."""
-    limits = {"max_gap_ns": _LONGEST_GAP_NS, "max_extrapolation_ns": 0}
+def rig_of_body(body: MovingBody, t_ns: Int64) -> tuple[SkeletalMotion, int]:
+    """Take a body, known at one of the times [T], as a rig from its first to its last; count held frames."""
+    half_step_ns = int(np.diff(t_ns).max(initial=0)) // 2 + 1  # some frame is so near to any pose
+    limits = {"max_gap_ns": _LONGEST_GAP_NS, "max_extrapolation_ns": half_step_ns}
     moved = [
         interpolate_poses(body.t_ns, body.centre[:, bone], body.rotation[:, bone], t_ns, **limits)
         for bone in range(len(BONES))
@@ -583,105 +473,13 @@ def rig_of_body(body: MovingBody, t_ns: Int64) -> Rigged:
         root=centre[:, 0],
         rotation=multiply(above, world),
     )
-    held = int(missing.sum())
-    return Rigged(skeletal, (), span.start, held, held * len(BONES), missing.size * len(BONES))
-
-
-def _rig_bones(place: dict[str, Float]) -> tuple[list[_RigBone], list[float]]:
-    """Choose the bones with known joints, parents first; return median distances from the parents' joints."""
-    head = next((bone for bone in _HEADS if bone.joint in place), None)
-    candidates = [*_TRUNK, *([head] if head else []), *_LIMBS]  # in the order in which files have them
-    kept: dict[str, _RigBone] = {}
-    lengths = []
-    for bone in candidates:
-        parent = kept.get(bone.parent or "")
-        if bone.parent is not None and parent is None:
-            continue  # its parent's joint is never known
-        if bone.joint not in place:
-            continue
-        start = place[parent.joint] if parent is not None else place[bone.joint]
-        length = np.linalg.norm(place[bone.joint] - start, axis=1)
-        if np.isfinite(length).any():
-            kept[bone.name] = bone
-            lengths.append(float(np.median(length[np.isfinite(length)])))
-    return list(kept.values()), lengths
-
-
-def _turns(
-    bones: list[_RigBone], parent: tuple[int, ...], place: dict[str, Float]
-) -> tuple[Float, tuple[int, int]]:
-    """Compute parent_from_bone [T, B, 4]; also count the rotations that are held, and all rotations."""
-    frames = len(place["hip"])
-    local, world = (np.zeros((frames, len(bones), 4)) for _ in range(2))
-    held = turns = 0
-    for k, bone in enumerate(bones):
-        above = world[:, parent[k]] if parent[k] >= 0 else np.tile([0.0, 0.0, 0.0, 1.0], (frames, 1))
-        next_ = next((b for b in bones if b.parent == bone.name and b.rest != _HERE), None)
-        if bone.name == "Hips":
-            known = multiply(
-                conjugate(above), _frame(_between(place, "right_hip", "left_hip"), _spine(place))
-            )
-        elif bone.name == "Spine" and {"left_shoulder", "right_shoulder"} <= place.keys():
-            across = _between(place, "right_shoulder", "left_shoulder")
-            known = multiply(conjugate(above), _frame(across, _spine(place), up_first=True))
-        elif next_ is None:
-            known = np.tile([0.0, 0.0, 0.0, 1.0], (frames, 1))
-        else:
-            aim = rotate(conjugate(above), place[next_.joint] - place[bone.joint])
-            known = _swing(np.array(next_.rest, float), aim)
-        local[:, k], missing = _held(known)
-        world[:, k] = multiply(above, local[:, k])
-        if next_ is not None:
-            held += int(missing.sum())
-            turns += frames
-    return local, (held, turns)
-
-
-def _between(place: dict[str, Float], start: str, end: str) -> Float:
-    return place[end] - place[start]
-
-
-def _spine(place: dict[str, Float]) -> Float:
-    return _between(place, "hip", "neck")
-
-
-def _frame(left: Float, up: Float, *, up_first: bool = False) -> Float:
-    """Build world_from_bone [T, 4]: y along `left` and z near `up`, or z along `up` and y near `left`."""
-    exact, near = (up, left) if up_first else (left, up)
-    first = _unit(exact)
-    second = _unit(near - (near * first).sum(axis=1, keepdims=True) * first)
-    y, z = (second, first) if up_first else (first, second)
-    matrix = np.stack([np.cross(y, z), y, z], axis=-1)
-    known = np.isfinite(matrix).all(axis=(1, 2))
-    turned = np.full((len(matrix), 4), np.nan)
-    turned[known] = quaternion_from_matrix(matrix[known])
-    return turned
-
-
-def _swing(start: Float, towards: Float) -> Float:
-    """Compute the smallest turns [T, 4] from the unit vector `start` [3] to the directions [T, 3]."""
-    end = _unit(towards)
-    turn = np.concatenate([np.cross(start, end), 1 + (end @ start)[:, None]], axis=1)
-    size = np.linalg.norm(turn, axis=1, keepdims=True)
-    x = np.array([1.0, 0.0, 0.0])
-    about = _unit((x if abs(start[0]) < 0.9 else np.roll(x, 1))[None])[0]
-    about = about - (about @ start) * start
-    half_turn = np.append(about / np.linalg.norm(about), 0.0)
-    return np.where(size < 1e-6, half_turn, turn / np.where(size < 1e-6, 1.0, size))
-
-
-def _unit(vectors: Float) -> Float:
-    """Scale vectors to length 1; NaN for the zero vector."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, np.nan)
+    return skeletal, int(missing.sum())
 
 
 def _held(rows: Float) -> tuple[Float, Bool]:
     """Replace missing rows [T, N] by the last known one; return the rows and the mask of missing ones."""
     missing = np.asarray(np.isnan(rows).any(axis=1), np.bool_)
     known = np.flatnonzero(~missing)
-    if not len(known):  # a bone that is never known at a time together with its parent and child
-        return np.tile(np.eye(rows.shape[1])[-1], (len(rows), 1)), missing
     last = np.maximum(np.searchsorted(known, np.arange(len(rows)), side="right") - 1, 0)
     return rows[known[last]], missing
 
