@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from pipelines.geometry.arrays import Int64, Picture
+from pipelines.geometry.arrays import Int64, Picture, nearest_rows
 from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
 from pipelines.reporting.content import ReplanContent, SessionContent, StudyContent, estimated_clocks, section
 from pipelines.reporting.page import draw_session, render_page
@@ -355,10 +355,7 @@ class _Shown:
         if self.every == 1 or not len(table):
             return table
         stamps = table["t_ns"].to_numpy(np.int64) + self._offset_ns.get(camera, 0)
-        after = np.searchsorted(stamps, self._t_ns).clip(0, len(stamps) - 1)
-        before = (after - 1).clip(0)
-        nearer = np.where(self._t_ns - stamps[before] <= stamps[after] - self._t_ns, before, after)
-        rows = np.unique(np.concatenate([nearer, (0, len(stamps) - 1)]))
+        rows = np.unique(np.concatenate([nearest_rows(stamps, self._t_ns), (0, len(stamps) - 1)]))
         return table.iloc[rows].reset_index(drop=True)
 
     def keypoints(self, stage: str, camera: str) -> pd.DataFrame:

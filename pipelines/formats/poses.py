@@ -20,7 +20,6 @@ from pipelines.formats.common.rows import (
     NORM_TOLERANCE,
     SECONDS,
     Heading,
-    TextTable,
     bounding_box,
     cell_name,
     describe_times,
@@ -36,7 +35,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Recording, Trajectory
 from pipelines.session.storage import read_text
-from pipelines.session.tables import COVARIANCE_COLUMNS
+from pipelines.session.tables import COVARIANCE_COLUMNS, pose_covariances
 
 POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 _POSITION_PREFIX = (
@@ -323,20 +322,10 @@ def _read_csv(path: Path) -> Trajectory:
         raise DataError(path, problem, "give all 21 of them or none", code="missing-column")
     table = rows_below(path, heading, text, {}, columns)
     stamps = parse_stamps(path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated)
-    covariance = None if missing else _covariance(table)
+    covariance = None if missing else pose_covariances(table.stack(COVARIANCE_COLUMNS))
     return clean_poses(
         path, *stamps, table.stack(POSITION), table.stack(QUATERNION), covariance, table.truncated
     )
-
-
-def _covariance(table: TextTable) -> Float:
-    """Build symmetric matrices [N, 6, 6] from their upper triangles."""
-    upper = table.stack(COVARIANCE_COLUMNS)
-    rows, columns = np.triu_indices(6)
-    covariance = np.zeros((len(upper), 6, 6))
-    covariance[:, rows, columns] = upper
-    covariance[:, columns, rows] = upper
-    return covariance
 
 
 def write_pose_csv(path: Path, trajectory: Trajectory) -> None:

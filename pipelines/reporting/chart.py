@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
 SIDES = {"left": "#1f78b5", "right": "#c8561b", "": "#4a4f55"}
-"""Colours of the sides of the body, by the words of `content.side_of`."""
+"""Colours of the sides of the body, by the words of `people.side_of`."""
 CAMERAS = ("#00785a", "#7d4fb5", "#8f7a00", "#9c2f4f", "#00808f", "#8c5a3c")
 """Colours of cameras, arms and sessions: neighbours differ in hue, none is the blue or orange of a side."""
 PEOPLE = ("#b0267a", "#3f48b8", "#a36f00", "#2a7d33", "#a8322b", "#4f6272")

@@ -14,7 +14,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.metrics import bone_lengths
 from pipelines.geometry.triangulation import STATUS
 from pipelines.session.description import Description
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Occupancy
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Occupancy, full_covariance
 
 # Joints are stored as this part of a picture's side, which fits 16 bits and is finer than a pixel.
 FULL_SCALE = 10_000
@@ -174,11 +174,6 @@ def motion_from_skeleton(table: pd.DataFrame) -> MeasuredMotion:
     )
 
 
-def full_covariance(upper: Float) -> Float:
-    """Return matrices [..., 3, 3] of their upper triangles [..., 6]: POINT_COVARIANCE_COLUMNS."""
-    return upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*upper.shape[:-1], 3, 3)
-
-
 def middles(position: Float) -> Float:
     """Return the coordinate-wise medians [T, P, 3] of joints [T, P, J, 3]; NaN where none is known."""
     there = np.isfinite(position[..., 0]).any(axis=-1)
@@ -226,12 +221,6 @@ _WATCHED = (
     ("shoulders", "", "left_shoulder", "right_shoulder"),
     ("hips", "", "left_hip", "right_hip"),
 )
-
-
-def side_of(*joints: str) -> str:
-    """Return `left` or `right` if all joints lie on that side of the body, else an empty word."""
-    sides = {joint.partition("_")[0] for joint in joints}
-    return side if len(sides) == 1 and (side := sides.pop()) in {"left", "right"} else ""
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,10 @@ from pipelines.reporting.chart import (
     stride_for,
     time_bins,
 )
-from pipelines.reporting.content import MeasuredMotion, middles, side_of
+from pipelines.reporting.content import MeasuredMotion, middles
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import STATUS_LABELS, joint_label, shortened
+from pipelines.session.people import side_of
 from pipelines.session.records import Trajectory
 from pipelines.session.tables import trajectory_from
 

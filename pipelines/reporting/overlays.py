@@ -24,7 +24,6 @@ from pipelines.reporting.content import (
     MeasuredMotion,
     SessionContent,
     estimated_clocks,
-    full_covariance,
     number,
     section,
 )
@@ -32,7 +31,7 @@ from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Description, Interpolation
 from pipelines.session.people import with_derived
-from pipelines.session.records import Trajectory
+from pipelines.session.records import Trajectory, full_covariance
 from pipelines.session.stages import StageRecord
 from pipelines.session.storage import read_json
 from pipelines.session.tables import (

@@ -17,7 +17,7 @@ from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.cameras import project, undistort
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.chart import INK, WIDTH_IN, Figure, Image, Mark, Panel, points_at
-from pipelines.reporting.content import MeasuredMotion, SessionContent, Strip, side_of
+from pipelines.reporting.content import MeasuredMotion, SessionContent, Strip
 from pipelines.reporting.overlays import (
     FilmedCamera,
     OverlayMoment,
@@ -29,7 +29,7 @@ from pipelines.reporting.overlays import (
 )
 from pipelines.reporting.summary import Summary
 from pipelines.reporting.wording import listing, quantity, shortened
-from pipelines.session.people import bones_of
+from pipelines.session.people import bones_of, side_of
 
 Colour = tuple[int, int, int]
 

@@ -24,17 +24,15 @@ from pipelines.reporting.content import (
     FULL_SCALE,
     MeasuredMotion,
     Strip,
-    full_covariance,
     middles,
-    side_of,
     standing_heights,
 )
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.maps import MapSurface
-from pipelines.session.people import DERIVED, bones_of
-from pipelines.session.records import MovingBody, Trajectory
+from pipelines.session.people import DERIVED, bones_of, side_of
+from pipelines.session.records import MovingBody, Trajectory, full_covariance
 from pipelines.session.tables import trajectory_from
 
 # Longer flights are thinned out, so that a page with 15 MB of pictures stays below 25 MB in base64.

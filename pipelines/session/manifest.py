@@ -374,13 +374,6 @@ class FrameTimes(FileSource):
     fps: Fps | None = None
     """Frame rate, which replaces the stamps of the video: 30, 29.97 or 30000/1001."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _start_by_its_old_name(cls, value: object) -> object:
-        if isinstance(value, dict) and value.get("start_from") == "container" and "start" not in value:
-            return {"start" if key == "start_from" else key: each for key, each in value.items()}
-        return value
-
     @model_validator(mode="after")
     def _from_one_place(self) -> FrameTimes:
         counted = (("start", "start_ns"), ("fps", "fps"))

@@ -37,6 +37,12 @@ DERIVED: tuple[tuple[str, tuple[str, str]], ...] = (
 """Joints that are computed if a skeleton lacks them: each is the midpoint of its two parents."""
 
 
+def side_of(*joints: str) -> str:
+    """Return `left` or `right` if all joints lie on that side of the body, else an empty word."""
+    sides = {joint.partition("_")[0] for joint in joints}
+    return side if len(sides) == 1 and (side := sides.pop()) in {"left", "right"} else ""
+
+
 def mirrored(joint: str) -> str:
     """Return the joint on the other side of the body; a joint of the middle is its own mirror."""
     if joint.startswith("left_"):

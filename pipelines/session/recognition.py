@@ -94,23 +94,6 @@ _AS_RECORD = (
 )
 _COPY = "it is damaged or of another kind: copy it again from where it was recorded"
 
-# Kind, the bytes at its beginning, the endings of its name. A file of this name with another beginning is
-# damaged. One with this beginning was not recognised for another reason.
-_BEGINNINGS = (
-    ("an MCAP log", b"\x89MCAP0\r\n", (".mcap",)),
-    ("a ROS 1 bag", b"#ROSBAG V", (".bag",)),
-    ("a PX4 log", b"ULog\x01\x12\x35", (".ulg",)),
-    ("an ArduPilot log", b"\xa3\x95", (".bin",)),
-    ("a bag's SQLite database", b"SQLite format 3\0", (".db3",)),
-    ("a Matroska or WebM video", b"\x1aE\xdf\xa3", (".mkv", ".webm")),
-    ("an OctoMap", b"# Octomap OcTree", (".bt", ".ot")),
-    ("a PLY point cloud", b"ply", (".ply",)),
-    ("a NumPy archive", b"PK\x03\x04", (".npz",)),
-)
-
-# Endings of other binary files.
-_BINARY = {".tlog", ".laz", ".las", ".mp4", ".mov", ".m4v", ".avi", ".lrv", ".ts", ".mts", ".c3d"}
-
 # Kinds that are known by their first bytes but not read, and the step that makes them usable.
 _UNREAD = (
     (re.compile(rb"\xff\xd8\xff"), "a JPEG picture", "of a sequence of pictures, name the folder"),
@@ -218,13 +201,6 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
     """Describe a file by its first bytes and its name; None if it may be text."""
     if len(head) >= 16 and (_is_wide(head[:64:2], head[1:64:2]) or _is_wide(head[1:64:2], head[:64:2])):
         return Likeness("is text in UTF-16 without a byte order mark", "save it as UTF-8")
-    for kind, magic, endings in _BEGINNINGS:
-        if path.suffix.lower() in endings and not head.startswith(magic):
-            return Likeness(
-                f"is called {path.suffix} but begins with {_quoted(head[: len(magic)])} instead of the "
-                f"{_quoted(magic)} of {kind}",
-                _COPY,
-            )
     is_dji = path.suffix.lower() in {".txt", ".dat"} and _DJI_BINARY.match(head)
     if is_dji or (_DJI_NAME.match(path.name) and _undecodable(head)):
         ways = "Airdata, PhantomHelp, Flight Reader or dji-log-parser"
@@ -233,16 +209,14 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
     for pattern, kind, remedy in _UNREAD:
         if pattern.match(head):
             return Likeness(f"is {kind}", remedy)
-    for kind, magic, _ in _BEGINNINGS:
-        if head.startswith(magic):
-            return Likeness(f"begins as {kind} but is none that can be read", _COPY)
-    if path.suffix.lower() in _BINARY:
-        return Likeness(f"is called {path.suffix} but holds nothing of that kind", _COPY)
-    if (b"\0" in head or _undecodable(head)) and text_encoding(head) != "utf-16":
-        if not any(c < 32 and c not in b"\t\n\f\r" for c in head):
-            return Likeness("is text, but not UTF-8", "save it as UTF-8")
-        return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
-    return None
+    is_control = any(c < 32 and c not in b"\t\n\f\r" for c in head)
+    if not (is_control or _undecodable(head)) or text_encoding(head) == "utf-16":
+        return None
+    if not is_control:
+        return Likeness("is text, but not UTF-8", "save it as UTF-8")
+    if kinds := [f.title for f in FORMATS.all() if path.suffix and path.suffix.lower() in f.suffixes]:
+        return Likeness(f"is called {path.suffix} but is no {_listed(kinds)} that can be read", _COPY)
+    return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
 
 
 def _is_wide(low: bytes, high: bytes) -> bool:

@@ -22,6 +22,11 @@ POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 """Upper triangle of a joint's covariance, m^2, as tables name it."""
 
 
+def full_covariance(upper: Float) -> Float:
+    """Return matrices [..., 3, 3] of their upper triangles [..., 6]: POINT_COVARIANCE_COLUMNS."""
+    return upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*upper.shape[:-1], 3, 3)
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Logged poses of an object: rising stamps, finite numbers, bad rows counted by cause in `dropped`."""

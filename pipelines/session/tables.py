@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Int64
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     POINT_COVARIANCE_COLUMNS,
@@ -305,14 +305,19 @@ def pose_schema(trajectory: Trajectory) -> pa.Schema:
     return pa.schema([*known, *((name, pa.float64()) for name in body)])
 
 
+def pose_covariances(upper: Float) -> Float:
+    """Build symmetric matrices [N, 6, 6] from their upper triangles [N, 21], `COVARIANCE_COLUMNS`."""
+    rows, columns = np.triu_indices(6)
+    covariance = np.zeros((len(upper), 6, 6))
+    covariance[:, rows, columns] = covariance[:, columns, rows] = upper
+    return covariance
+
+
 def trajectory_from(table: pd.DataFrame) -> Trajectory:
     """Rebuild the trajectory that `pose_table` stored."""
     covariance = None
     if set(COVARIANCE_COLUMNS) <= set(table.columns):
-        covariance = np.zeros((len(table), 6, 6))
-        rows, columns = np.triu_indices(6)
-        covariance[:, rows, columns] = table[list(COVARIANCE_COLUMNS)].to_numpy()
-        covariance[:, columns, rows] = covariance[:, rows, columns]
+        covariance = pose_covariances(table[list(COVARIANCE_COLUMNS)].to_numpy())
     return Trajectory(
         t_ns=table["t_ns"].to_numpy(np.int64),
         position=table[_POSITION].to_numpy(np.float64),

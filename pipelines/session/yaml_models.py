@@ -97,21 +97,9 @@ def describe_problem(
     return f"{place}: {message}" if place else message
 
 
-_RENAMED = {
-    **dict.fromkeys(("path", "log", "csv", "srt", "tum", "static", "dji", "ulog", "ardupilot"), "file"),
-    **dict.fromkeys(("tlog", "gopro", "joints"), "file"),
-    "fixed": "yaw_deg",
-    "body_from_camera": "rotation_xyzw",
-    "world_from_log": "world_from_source",
-}
-"""Keys of earlier versions of flight.yaml, with their names today."""
-
-
 def unknown_key(key: str, known: Sequence[str]) -> str:
     """Describe a key that nothing knows, with the nearest known one."""
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    if (renamed := _RENAMED.get(key)) in known:
-        return f"unknown key, it is called {renamed!r} now"
     hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
     return f"unknown key, {hint}"
 

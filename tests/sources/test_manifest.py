@@ -1,4 +1,4 @@
-"""Sources of a manifest: their formats by content, the options of each, and the spellings of old files."""
+"""Sources of a manifest: their formats by content, and the options of each."""
 
 from typing import Any
 
@@ -29,18 +29,6 @@ FIXES = [
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> SyntheticFlight:
     return write_flight(tmp_path_factory.mktemp("flight"), cameras=2, seconds=0.2, clean=True)
-
-
-@pytest.mark.parametrize(
-    ("part", "old", "new"), [("pose", "ulog", "file"), ("mount", "body_from_camera", "rotation_xyzw")]
-)
-def test_an_old_spelling_is_refused_with_the_new_one(
-    flight: SyntheticFlight, part: str, old: str, new: str
-) -> None:
-    with pytest.raises(DataError) as caught:
-        checked(flight, {part: {old: "x"}})
-    assert f"cameras.drone1.{part}" in caught.value.problem
-    assert new in caught.value.problem
 
 
 def checked(flight: SyntheticFlight, change: dict[str, Any]) -> None:

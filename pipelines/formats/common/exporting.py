@@ -9,7 +9,7 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MapSurface, surface_of
-from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory
+from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory, full_covariance
 
 CHI2_95 = 7.815
 """An ellipsoid {x : x' S^-1 x = 7.815} holds 95 % of a Gaussian in three dimensions (chi-square)."""
@@ -75,7 +75,7 @@ def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:
 
     `covariance` is [..., 6] m^2, the upper triangle by rows; NaN gives NaN.
     """
-    full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*covariance.shape[:-1], 3, 3)
+    full = full_covariance(covariance)
     known = np.isfinite(full).all(axis=(-2, -1))
     half = np.full((*known.shape, 3), np.nan)
     turn = np.full((*known.shape, 4), np.nan)

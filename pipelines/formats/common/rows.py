@@ -163,16 +163,21 @@ def parse_stamps(
     return t_ns, readable
 
 
+def since_epoch_ns(moment: datetime) -> int:
+    """Return the ns since 1970 of a moment with a zone, exact to its microseconds."""
+    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
 def _date_ns(text: str) -> int | None:
     """Parse a date with a time by ISO 8601, also with a blank for the T, as ns since the epoch, or None."""
     match = _DATE.fullmatch(text)
     if match is None:
         return None
     try:
-        elapsed = datetime.fromisoformat(match[1].replace(" ", "T") + (match[3] or "+00:00")) - _EPOCH
+        whole = datetime.fromisoformat(match[1].replace(" ", "T") + (match[3] or "+00:00"))
     except ValueError:
         return None
-    t_ns = elapsed // timedelta(seconds=1) * 10**9 + int((match[2] or "0").ljust(9, "0"))
+    t_ns = since_epoch_ns(whole) + int((match[2] or "0").ljust(9, "0"))
     return t_ns if abs(t_ns) <= _LARGEST else None
 
 

@@ -10,7 +10,7 @@ import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
+from pipelines.formats.common.rows import since_epoch_ns
 from pipelines.formats.drone_logs.dji_subtitles import (
     DjiRows,
     any_finite,
@@ -68,8 +69,6 @@ _CLOCK = re.compile(
 )
 _DAY_OF_NAME = re.compile(r"(\d{4})[-_](\d{2})[-_](\d{2})")
 _MARK = re.compile(r"[.,](?=\d)")
-# Stamps count from this moment.
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class DjiRecordFormat(DroneLog):
@@ -353,7 +352,7 @@ def _since_epoch_ns(match: re.Match[str], day_first: bool) -> int:
         return 0
     if not _FIRST_YEAR <= year < _LAST_YEAR:
         return 0
-    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000 + int((match[7] or "").ljust(9, "0"))
+    return since_epoch_ns(moment) + int((match[7] or "").ljust(9, "0"))
 
 
 FORMAT = DjiRecordFormat()

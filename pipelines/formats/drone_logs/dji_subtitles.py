@@ -12,13 +12,13 @@ Three generations, with angles of an FRD body and gimbal in NED:
 import re
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from pipelines.formats.common.files import read_bytes, read_head
-from pipelines.formats.common.rows import longest_rising
+from pipelines.formats.common.rows import longest_rising, since_epoch_ns
 from pipelines.formats.drone_logs.telemetry_rows import (
     DroneLog,
     attitude_track,
@@ -187,8 +187,6 @@ _CLOCK = re.compile(
 _UNTIMED = re.compile(r"(?m)^\d+[ \t]*\n(?=\d{4}[-./]\d{1,2}[-./]\d{1,2} +\d)")
 # Drones' cameras have focal lengths up to this; larger numbers count tenths.
 MAX_FOCAL_35_MM = 170.0
-# Stamps count from this moment.
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # Stamps are int64, which ends in the year 2262.
 _LARGEST_NS = 2**63
 # Subtitles further apart than this come once a second and show whole seconds.
@@ -267,10 +265,10 @@ def _clock_ns(text: str) -> int | None:
         return None
     *whole, milliseconds, microseconds = (int(part or 0) for part in match.groups())
     try:
-        elapsed = datetime(*whole, tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]  # six integers
+        moment = datetime(*whole, tzinfo=UTC)  # type: ignore[misc,arg-type]  # six integers
     except ValueError:
         return None
-    t_ns = elapsed // timedelta(microseconds=1) * 1000 + milliseconds * 1_000_000 + microseconds * 1000
+    t_ns = since_epoch_ns(moment) + milliseconds * 1_000_000 + microseconds * 1000
     return t_ns if abs(t_ns) < _LARGEST_NS else None
 
 

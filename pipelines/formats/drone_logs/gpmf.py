@@ -50,7 +50,8 @@ _KINDS = {
 _FIX_3D = 3
 # A packet of a second has one time only, so its rows are known to about this.
 _PACKET_S = 0.2
-_DAYS_TO_2000 = (datetime(2000, 1, 1, tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)).days
+# GPS9 counts days from 2000, which are so many after 1970.
+_DAYS_TO_2000 = 10_957
 
 
 @dataclass

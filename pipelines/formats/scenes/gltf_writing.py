@@ -24,7 +24,7 @@ from pipelines.geometry.arrays import Float, Int64, Intrinsics, nearest_rows
 from pipelines.geometry.body_model import body_model
 from pipelines.geometry.poses import continuous_signs, multiply
 from pipelines.session.errors import DataError
-from pipelines.session.people import bones_of, with_derived
+from pipelines.session.people import bones_of, side_of, with_derived
 from pipelines.session.records import JointMotion, MovingBody, Recording, Trajectory
 
 # Viewers interpolate between key frames of this rate without a visible difference.
@@ -85,14 +85,14 @@ def _add_person(
         known = np.isfinite(place[:, j, 0])
         if known.any():
             size = np.repeat(known[:, None], 3, axis=1).astype(np.float64)
-            asset.moving(f"{label}{name}", spheres[_side(name)], translation=held(place[:, j]), scale=size)
+            asset.moving(f"{label}{name}", spheres[side_of(name)], translation=held(place[:, j]), scale=size)
     for start, end in bones_of(joints):
         low, span = place[:, joints.index(start)], place[:, joints.index(end)] - place[:, joints.index(start)]
         length = np.linalg.norm(span, axis=1)
         known = length > 0  # False for NaN
         if known.any():
             size = np.where(known[:, None], np.stack([known, length, known], axis=1), 0.0)
-            side = _side(start) if _side(start) == _side(end) else ""
+            side = side_of(start, end)
             direction = held(np.where(known[:, None], span, np.nan))
             x, y, z = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).T
             turn = np.stack([z, np.zeros_like(x), -x, 1 + y], axis=1)
@@ -121,11 +121,6 @@ def _add_camera(asset: GltfAsset, name: str, track: Trajectory, lens: Intrinsics
         "name": name,
     }
     asset.moving(name, None, camera=camera, translation=np.stack([x, z, -y], axis=1), rotation=turn)
-
-
-def _side(joint: str) -> str:
-    side = joint.partition("_")[0]
-    return side if side in _MATERIALS else ""
 
 
 def held(values: Float) -> Float:

@@ -41,7 +41,7 @@ from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float, Intrinsics
 from pipelines.geometry.cameras import rescaled
 from pipelines.session.errors import DataError
-from pipelines.session.people import bones_of, with_derived
+from pipelines.session.people import bones_of, side_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
 
 # Foxglove loads chunks of this size quickly.
@@ -424,8 +424,7 @@ def _points(points: Float) -> list[dict[str, float]]:
 
 
 def _colour(joint: str, alpha: float = 1.0) -> dict[str, float]:
-    side = joint.partition("_")[0] if joint.startswith(("left_", "right_")) else ""
-    return {**dict(zip("rgb", _COLOURS[side], strict=True)), "a": alpha}
+    return {**dict(zip("rgb", _COLOURS[side_of(joint)], strict=True)), "a": alpha}
 
 
 EXPORT = McapExport()

@@ -25,7 +25,7 @@ from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.cameras import camera_matrix, rescaled
 from pipelines.session.errors import DataError
-from pipelines.session.people import bones_of, with_derived
+from pipelines.session.people import bones_of, side_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import need
 
@@ -223,7 +223,7 @@ def _blueprint(rr: Any, cameras: list[str]) -> Any:
 
 
 def _colour(joint: str) -> tuple[int, int, int]:
-    return _COLOURS[joint.partition("_")[0] if joint.startswith(("left_", "right_")) else ""]
+    return _COLOURS[side_of(joint)]
 
 
 EXPORT = RerunExport()

@@ -31,7 +31,7 @@ from pipelines.formats.common.rows import (
     rows_below,
 )
 from pipelines.formats.poses import write_pose_csv
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64, nearest_rows
 from pipelines.geometry.joint_angles import ANGLES
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
@@ -130,9 +130,9 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
 
 def _interpolated(motion: JointMotion, even_ns: Int64, longest_ns: int) -> JointMotion:
     position = interpolate_points(motion.t_ns, motion.position, even_ns, max_gap_ns=longest_ns)
-    after = np.clip(np.searchsorted(motion.t_ns, even_ns), 1, len(motion.t_ns) - 1)
-    is_before = even_ns - motion.t_ns[after - 1] <= motion.t_ns[after] - even_ns
-    return _taken(motion, after - is_before, replace(motion, t_ns=even_ns, position=position))
+    return _taken(
+        motion, nearest_rows(motion.t_ns, even_ns), replace(motion, t_ns=even_ns, position=position)
+    )
 
 
 def _taken(motion: JointMotion, row: Int64, even: JointMotion) -> JointMotion:

@@ -17,7 +17,7 @@ from pipelines.formats.common.rows import (
     rows_below,
 )
 from pipelines.formats.drone_logs.dji_subtitles import parse_subtitles, read_subtitles
-from pipelines.geometry.arrays import Bool, Int64
+from pipelines.geometry.arrays import Bool, Int64, nearest_rows
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_text
 
@@ -83,9 +83,7 @@ def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
     if stamps.media_ns is not None:
         keys, wanted = stamps.media_ns, pts_ns
         tolerance = int(np.median(np.diff(keys))) // 2 if len(keys) > 1 else 0
-    after = np.clip(np.searchsorted(keys, wanted), 0, len(keys) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(keys[before] - wanted) < np.abs(keys[after] - wanted), before, after)
+    nearest = nearest_rows(keys, wanted)
     known: Bool = np.abs(keys[nearest] - wanted) <= tolerance
     return np.where(known, stamps.t_ns[nearest], 0), known
 

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from pipelines.formats.common.rows import since_epoch_ns
 from pipelines.formats.drone_logs.dji_subtitles import DjiRows, telemetry_of_rows
 from pipelines.formats.drone_logs.telemetry_rows import DroneLog
 from pipelines.geometry.arrays import Float, Int64, Picture
@@ -25,8 +26,6 @@ _OF_AIRSIM = re.compile(r"img_(.+)_\d{12,}")
 _HEAD = 512 * 1024
 # EXIF counts whole seconds.
 _SECOND_NS = 1_000_000_000
-# Stamps count from this moment.
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _TAG = re.compile(rb"(?<![\w/-])drone(?:-dji)?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
 _EXIF, _GPS = 0x8769, 0x8825
 _TAKEN, _OFFSET, _SUBSECOND, _FOCAL_35_MM = 36867, 36881, 37521, 41989
@@ -134,7 +133,7 @@ def _taken_ns(exif: Mapping[int, Any]) -> int | None:
     if offset:
         ahead = timedelta(hours=int(offset[2]), minutes=int(offset[3]))
         taken -= ahead if offset[1] == "+" else -ahead
-    return (taken - _EPOCH) // timedelta(seconds=1) * 10**9 + int(digits.ljust(9, "0") or 0)
+    return since_epoch_ns(taken) + int(digits.ljust(9, "0") or 0)
 
 
 def _from_gps(gps: Mapping[int, Any]) -> dict[str, float]:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from fractions import Fraction
 from functools import lru_cache
 from itertools import chain, takewhile
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from pipelines.formats.common.rows import describe_times
+from pipelines.formats.common.rows import describe_times, since_epoch_ns
 from pipelines.geometry.arrays import Bool, Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import UNTIMED, VideoIndex
@@ -36,10 +36,8 @@ if TYPE_CHECKING:
 _SHORTEST_S = 1e-5
 # Frames after the year 2096 are damage, and int64 ns hold 292 years.
 _LATEST_S = 4 * 10**9
-# Stamps count from this moment.
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # MP4 counts from 1904 and a clock that was never set from 1970: such dates are none.
-_NO_DATE_BEFORE = timedelta(days=365)
+_NO_DATE_BEFORE_NS = 365 * 86_400 * 10**9
 # A frame that no seek to one of so many key frames gives counts as undecodable.
 _MOST_KEY_FRAMES = 3
 # A larger size in a header is damage and would exhaust the memory.
@@ -153,9 +151,9 @@ def created_ns(path: Path) -> int | None:
             made = datetime.fromisoformat(text)
         except ValueError:
             continue
-        elapsed = (made if made.tzinfo else made.replace(tzinfo=UTC)) - _EPOCH
-        if elapsed > _NO_DATE_BEFORE:
-            return elapsed // timedelta(microseconds=1) * 1000
+        t_ns = since_epoch_ns(made if made.tzinfo else made.replace(tzinfo=UTC))
+        if t_ns > _NO_DATE_BEFORE_NS:
+            return t_ns
     return None
 
 
