@@ -23,7 +23,7 @@ from pipelines.planning.replay import Pilot, Start
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
-from pipelines.session.records import Occupancy, SkeletalMotion
+from pipelines.session.records import SkeletalMotion
 from pipelines.session.storage import (
     SIMULATION_MARK,
     hash_of,
@@ -95,7 +95,12 @@ def simulate(
         write_truth(making.folder, flight)
         progress.advance()
         occupancy = flight.world.occupancy(scenario.world.map.resolution_m, scenario.world.map.height_m)
-        _write_grid(making.folder / "site.npz", occupancy)
+        np.savez_compressed(
+            making.folder / "site.npz",
+            probability=occupancy.probability,
+            origin=occupancy.origin,
+            resolution_m=np.float64(occupancy.resolution_m),
+        )
         progress.advance()
         for drone in flight.drones:
             with Ros2Recording(making.folder / f"{drone.name}.mcap") as log:
@@ -197,15 +202,6 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
         return slots
 
     return start
-
-
-def _write_grid(path: Path, occupancy: Occupancy) -> None:
-    np.savez_compressed(
-        path,
-        probability=occupancy.probability,
-        origin=occupancy.origin,
-        resolution_m=np.float64(occupancy.resolution_m),
-    )
 
 
 def _film(

@@ -393,11 +393,6 @@ def _estimates(
 # --- figures ---
 
 
-def draw_arms(replan: Replan) -> list[Figure]:
-    """Draw the figures of a comparison; none where nothing flew."""
-    return [draw_from_above(replan), draw_arms_over_time(replan.arms)] if replan.arms else []
-
-
 def draw_arms_over_time(arms: tuple[ArmTrack, ...]) -> Figure:
     """Draw tilt, range, sight, predicted error and yaw of all arms over the same time."""
     lines: dict[str, list[Line]] = {

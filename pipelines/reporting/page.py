@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting import wording
-from pipelines.reporting.arms import Replan, draw_arms, summarise_replan
+from pipelines.reporting.arms import Replan, draw_arms_over_time, draw_from_above, summarise_replan
 from pipelines.reporting.chart import MOST_BINS, Figure
 from pipelines.reporting.content import SessionContent, as_reconstructed, items, number, section, text
 from pipelines.reporting.figures import draw_all
@@ -113,7 +113,7 @@ def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> l
     residuals = residuals_over_time(as_reconstructed(content), summary, MOST_BINS)
     return [
         *draw_all(summary, content.poses, residuals, content.angles),
-        *(draw_arms(replan) if replan is not None else []),
+        *([draw_from_above(replan), draw_arms_over_time(replan.arms)] if replan and replan.arms else []),
         *(draw_study(f"study-{k}", study.metrics) for k, study in enumerate(content.studies, start=1)),
     ]
 

@@ -199,14 +199,10 @@ def jsonable(value: object) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be written as JSON")
 
 
-def canonical_json(value: object) -> str:
-    """Write a value as one JSON text, the same for any order of keys; the keys of stages are its hashes."""
-    return json.dumps(jsonable(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
-
-
 def hash_of(value: object) -> str:
-    """Compute the SHA-256 of a value of types that `jsonable` accepts: equal for equal values."""
-    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+    """Compute the SHA-256 of a value of types that `jsonable` accepts: the same for any order of keys."""
+    text = json.dumps(jsonable(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -417,11 +417,6 @@ def sample_log(
     return poses_at(paths, drone, log_times(rate_hz, span_s, rng))
 
 
-def gimbal_attitude(camera_xyzw: Float) -> Float:
-    """Convert world_from_camera [..., 4] to world_from_gimbal: x is the view, z up in the picture."""
-    return multiply(camera_xyzw, conjugate(body_from_camera("forward")))
-
-
 def estimate(truth: DronePoses, models: Sequence[NoiseModel], rng: np.random.Generator) -> PoseLog:
     """Simulate one drone's log with the errors of some models, and the covariances that belong to them.
 
@@ -443,7 +438,7 @@ def estimate(truth: DronePoses, models: Sequence[NoiseModel], rng: np.random.Gen
     stated = bool(covariance.any())
     return PoseLog(
         Trajectory(truth.t_ns, *body, carried if stated else None),
-        gimbal_attitude(camera[1]),
+        multiply(camera[1], conjugate(body_from_camera("forward"))),
         Trajectory(truth.t_ns, *camera, covariance if stated else None),
     )
 

@@ -67,11 +67,6 @@ def swing_steps(speed_mps: float, run: float) -> float:
     return (1 - run) * walk + run * jog
 
 
-def above_foot(run: float) -> float:
-    """Return the share of a stance at which the pelvis passes above the ankle."""
-    return 0.36 - 0.05 * run
-
-
 @dataclass(frozen=True)
 class Roll:
     """Strike, roll and swing of a foot, as (share of stance or swing, value) keys."""
@@ -555,8 +550,8 @@ class Plan:
             before = swing_steps(*rhythm.gait_at(rhythm.when(number - 1)))
             lift_s = max(rhythm.when(number - max(in_air, before)), stretch.start_s)
             lift_s = min(lift_s, rhythm.outruns(self.feet[foot][-1], _REACH * self.leg_m))
-            # The stance lasts 2 - in_air steps.
-            above_s = rhythm.when(number + above_foot(run) * (2 - in_air))
+            # The stance lasts 2 - in_air steps; at this share of it the pelvis passes above the ankle.
+            above_s = rhythm.when(number + (0.36 - 0.05 * run) * (2 - in_air))
             place, heading = _reached(stretch, strike_s, above_s, speed)
             self._put(foot, lift_s, strike_s, self._beside(foot, place, heading, speed, run), run)
             self.t_s = strike_s

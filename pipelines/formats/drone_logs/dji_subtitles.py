@@ -251,7 +251,8 @@ def parse_subtitles(text: str) -> Subtitles:
     texts = [text[block.end() : end] for block, end in zip(blocks, ends, strict=False)]
     clock_ns = np.array([_clock_ns(each) or 0 for each in texts], dtype=np.int64)
     if timed:
-        media_ns = np.array([_timecode_ns(block) for block in blocks], dtype=np.int64)
+        parts = [[int(part[-6:]) for part in block.groups()[:4]] for block in blocks]
+        media_ns = np.array(parts, np.int64) @ np.array([3_600_000, 60_000, 1000, 1], np.int64) * 1_000_000
     else:  # since the first clock time; a subtitle without one has the time of the one before
         shown = np.maximum.accumulate(clock_ns)
         media_ns = shown - clock_ns[:1]
@@ -270,11 +271,6 @@ def _clock_ns(text: str) -> int | None:
         return None
     t_ns = since_epoch_ns(moment) + milliseconds * 1_000_000 + microseconds * 1000
     return t_ns if abs(t_ns) < _LARGEST_NS else None
-
-
-def _timecode_ns(block: re.Match[str]) -> int:
-    hours, minutes, seconds, milliseconds = (int(part[-6:]) for part in block.groups()[:4])
-    return (((hours * 60 + minutes) * 60 + seconds) * 1000 + milliseconds) * 1_000_000
 
 
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"

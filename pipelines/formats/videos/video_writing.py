@@ -46,7 +46,7 @@ def write_h264(
     """Encode pictures [H, W, 3] BGR (even sides) as an H.264 MP4 in one thread, shown at `pts_ns` [N]."""
     import av
 
-    ticks = ticks_of(pts_ns)
+    ticks = [round(Fraction(stamp, 10**9) / TICK_S) for stamp in pts_ns.tolist()]
     with av.open(str(path), "w", options=_OPTIONS) as container:
         stream = container.add_stream("libx264", rate=30)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
@@ -121,11 +121,6 @@ def join_videos(path: Path, parts: Sequence[Path]) -> None:
         for packet in _packets(parts):
             packet.stream = stream
             container.mux(packet)
-
-
-def ticks_of(pts_ns: Int64) -> list[int]:
-    """Convert stamps to units of `TICK_S`, rounded to the nearest."""
-    return [round(Fraction(stamp, 10**9) / TICK_S) for stamp in pts_ns.tolist()]
 
 
 def _packets(parts: Sequence[Path]) -> Iterator[Packet[VideoStream]]:
