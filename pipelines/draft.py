@@ -209,10 +209,7 @@ def _is_session(folder: Path) -> bool:
 
 
 def must_be_drafted(manifest: Path) -> bool:
-    """Test if there is no manifest, or a draft of its folder that nobody edited and that can be better now.
-
-    Something is missing in such a draft, or the folder has other files than when it was drafted.
-    """
+    """Test if there is no manifest, or an unedited draft that lacks something or whose files changed."""
     try:
         text, mark, digests = manifest.read_text(encoding="utf-8", errors="replace").rpartition(_DRAFT)
     except (FileNotFoundError, NotADirectoryError):

@@ -204,10 +204,7 @@ def _keep_by_name(
 
 
 def inputs_of(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
-    """Load the inputs: all that was ingested, and the reconstruction if there is no truth or no actor.
-
-    If the errors of the session's own detector were measured, the arms are scored with those.
-    """
+    """Load the inputs: all that was ingested, and the reconstruction if there is no truth or no actor."""
     ingested = session.ingested()
     description = read_description(session.folder)
     inputs = dict(ingested.outputs)
@@ -229,10 +226,7 @@ def detector_errors(session: WritableSession) -> DetectorErrors:
 
 
 def error_model(errors: DetectorErrors, joints: tuple[str, ...]) -> ErrorModel:
-    """Build the ray model's errors of a detector from its measured table; those of poses are the defaults.
-
-    Standard deviations are root mean squares over the joints; without joints, the table's row for any joint.
-    """
+    """Build the ray model's errors from a detector's table: RMS over joints, or its row for any joint."""
     table = read_errors(errors_of(errors.detector))
     tilts_deg = np.unique(np.concatenate([rows[:, 0] for rows in table.rows.values()]))
     share, missed, _ = table.at(tilts_deg, joints or (ANY_JOINT,))

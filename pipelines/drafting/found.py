@@ -88,10 +88,7 @@ def label_of(text: str) -> Label:
 
 
 def label_of_place(place: NamePlace) -> Label:
-    """Return the label of a file: that of its name, with numbered folders above it (drone1/DJI_0001.mp4).
-
-    If the name has no label (drone1/video.mp4), it is the label of the nearest folder that has one.
-    """
+    """Return the label of a file's name with numbered folders above it, else of the nearest folder."""
     *folders, name = place
     own = label_of(name)
     above = [label_of(folder) for folder in folders]

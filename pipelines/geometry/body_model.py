@@ -143,10 +143,7 @@ class BodyModel:
         return self.skin(shape).moved(*skinning.transforms(root, rotation))
 
     def simplified(self, cell: float) -> tuple[Index, Index]:
-        """Choose vertices [V'] about a cell apart, of a stature of 1, and the triangles [F, 3] between them.
-
-        Vertices of one cell and one bone become the first of them (Rossignac and Borrel 1993).
-        """
+        """Choose vertices [V'], one for each cell and bone (Rossignac 1993), and their triangles [F, 3]."""
         key = np.column_stack([np.floor(self.vertex[0] / cell), self.weights.argmax(axis=1)])
         _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
         corners = group.ravel()[np.concatenate([self.quads[:, [0, 1, 2]], self.quads[:, [0, 2, 3]]])]

@@ -270,10 +270,7 @@ def carried_covariance(
 
 
 def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> Float:
-    """Convert a covariance in ROS's convention to one with its rotation part about the body's axes.
-
-    geometry_msgs/PoseWithCovariance turns about fixed axes: R_true = exp(w) R = R exp(R' w).
-    """
+    """Convert a covariance about ROS's fixed axes to the body's: R_true = exp(w) R = R exp(R' w)."""
     return carried_covariance(covariance, rotation_xyzw=conjugate(world_from_body_xyzw))
 
 

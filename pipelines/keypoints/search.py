@@ -186,10 +186,7 @@ def square_about(centre: tuple[float, float], side: float, width: int, height: i
 def squares_about(
     centre: tuple[float, float], height_px: float, margin_px: float, width: int, height: int
 ) -> list[Tile]:
-    """List squares of 3 body heights that cover a body with an uncertain centre; at most 3 x 3.
-
-    A square holds whole bodies whose centres are within one height of its own.
-    """
+    """List at most 3 x 3 squares of 3 body heights that cover a body with an uncertain centre."""
     count = min(max(math.ceil(margin_px / height_px), 1), 3)
     offsets = [2 * height_px * (i - (count - 1) / 2) for i in range(count)]
     squares = [

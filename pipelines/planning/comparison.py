@@ -269,10 +269,7 @@ def _difference(
 
 
 def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]:
-    """Judge by each decisive figure if one arm is better (1) or worse (-1) than another, or neither (0).
-
-    A difference counts if noise does not explain it and if it has a practical size.
-    """
+    """Judge by each decisive figure if an arm is better (1), worse (-1), or neither (0: noise, or small)."""
     found = []
     for name, (smallest, better) in _DECISIVE.items():
         change = difference[name]

@@ -40,10 +40,7 @@ class ErrorModel:
 
 @dataclass(frozen=True)
 class PlannerTuning:
-    """Values that no operator states; docs/results.md has what was measured.
-
-    The tests of tests/planning vary them; a session replaces `errors`.
-    """
+    """Values that no operator states (docs/results.md, tests/planning); a session replaces `errors`."""
 
     # --- formation search ---
     # Cells of 45 deg let turning formations sweep through what stands between them; 32 leave 11 deg.

@@ -616,10 +616,7 @@ def _across_ray(offset: Float) -> tuple[Float, Float]:
 
 
 def smooth(series: Float, information: Float, stiffness: Float) -> None:
-    """Smooth series [T, S, 3]: minimise sum (x - y)' W (x - y) + stiffness sum |second difference of x|^2.
-
-    The information W is [T, S, 3, 3], 0 where nothing was measured.
-    """
+    """Minimise sum (x - y)' W (x - y) + stiffness sum |x''|^2 for series [T, S, 3], W [T, S, 3, 3] or 0."""
     from scipy.linalg import solveh_banded
 
     bend = np.zeros((3, len(series), 1))  # squares of second differences by lag, 0 to 2, and the later time

@@ -259,10 +259,7 @@ def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> 
 
 
 def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
-    """Interpolate the on-board planner's commanded positions [K, T, 3], linearly, and mask the valid ones.
-
-    The mask [K, T] is False before the first command, after the last one, and between two that lie far apart.
-    """
+    """Interpolate commanded positions [K, T, 3], and mask those between two commands near each other."""
     position, known = np.empty((len(flight.planned), len(t_ns), 3)), []
     for i, (stamps, sent) in enumerate(flight.planned.values()):
         after = np.searchsorted(stamps, t_ns, side="left").clip(1, max(len(stamps) - 1, 1))
@@ -573,10 +570,7 @@ def build_scene(
     *,
     errors: ErrorModel | None = None,
 ) -> ReplayScene:
-    """Prepare a comparison: distance fields, times, the first camera's start, and warnings.
-
-    `errors` are those of the detector, by default as in `ErrorModel`; those of the poses are the flight's.
-    """
+    """Prepare a comparison: distance fields, times, the first camera's start, and warnings."""
     notes = []
     unknown: Unknown = description.map.unknown if description.map else "free"
     maps = sorted(maps, key=lambda one: one.from_ns)

@@ -91,10 +91,7 @@ def _minors(matrix: Float) -> tuple[Float, Float]:
 
 
 def hidden_by_people(camera: Float, target: Float, people: Float) -> Bool:
-    """Test [...] if somebody's body, an upright cylinder, stands in a line of sight.
-
-    Camera and target are [..., 3] m, world; people [Q, ..., 3] the hips of those who may stand in the way.
-    """
+    """Test [...] if a body, an upright cylinder about hips [Q, ..., 3], stands in a line of sight."""
     way, aside = target - camera, people - camera
     level = np.maximum((way[..., :2] ** 2).sum(axis=-1), 1e-12)
     along = (aside[..., :2] * way[..., :2]).sum(

@@ -115,10 +115,7 @@ def _tables() -> dict[str, Landmarks]:
 
 
 def landmarks_of(joints: Sequence[str]) -> tuple[Landmarks, Index] | None:
-    """Return the landmarks among a skeleton's joints and their columns; None if there are too few.
-
-    Mouth corners tell BlazePose; every other skeleton has the places of COCO's annotators.
-    """
+    """Return a skeleton's landmarks (mouth corners tell BlazePose's) and columns; None for too few."""
     table = _tables()["blazepose" if "left_mouth" in joints else "coco"]
     kept = np.array([k for k, name in enumerate(table.joints) if name in joints], dtype=np.intp)
     names = [table.joints[k] for k in kept.tolist()]

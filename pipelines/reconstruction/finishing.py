@@ -161,10 +161,7 @@ def finish(
     fill_s: float | None,
     smoother: Butterworth | None,
 ) -> tuple[Triangulation, dict[str, Any]]:
-    """Fill gaps of at most `fill_s` (None: none), smooth (None: not), and report both as JSON.
-
-    Residuals are those of the new positions. Filled joints have no residuals and no views.
-    """
+    """Fill gaps of at most `fill_s` (None: none), smooth (None: not), and report both as JSON."""
     report: dict[str, Any] = {"filled": None, "smoothing": None}
     shape = observations.confidence.shape[:3]
     position = result.points.reshape(*shape, 3)

@@ -202,10 +202,7 @@ def source_of_pose_noise(
 
 
 def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> tuple[Float, Bool]:
-    """Load the prior standard deviation [C] s of each clock offset, and whether somebody stated the offset.
-
-    The deviation is 0 for known clocks. `with_reference` holds one where none is known.
-    """
+    """Load the prior deviation [C] s of each clock offset, 0 if known, and whether somebody stated it."""
     clocks = [description.cameras[camera.name].clock for camera in cameras]
     sigma_s = np.array([clock.prior_sigma_s for clock in clocks])
     return sigma_s, np.array([clock.sigma_s > 0 or clock.start == "stated" for clock in clocks])

@@ -167,10 +167,7 @@ class Observations:
 
 
 def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
-    """Choose the times of the skeleton: the frames of the camera with the most of them, or a stated rate.
-
-    Ties go to the first listed. With a rate, the times fill the span of all cameras' frames.
-    """
+    """Choose the skeleton's times: the frames of the first camera with most, or a rate over all spans."""
     if rate_hz is None:
         return max(cameras, key=lambda camera: len(camera.frame_t_ns)).frame_t_ns
     first = min(int(camera.frame_t_ns[0]) for camera in cameras)
@@ -210,10 +207,7 @@ def _poses_at(cameras: list[Camera], t_ns: Int64, between: Interpolation) -> tup
 def observe(
     cameras: list[Camera], found: Candidates, choice: Int64, t_ns: Int64, between: Interpolation
 ) -> Observations:
-    """Interpolate the keypoints of chosen detections [T', C, P] (-1: none) and the poses to common times [T].
-
-    Poses at times of the candidates are theirs.
-    """
+    """Interpolate chosen detections' keypoints [T', C, P] (-1: none) and poses to common times [T]."""
     views, weights, sigmas = [], [], []
     for c, camera in enumerate(cameras):
         rays, confidence = sightings_of(camera, found, c, choice[:, c])

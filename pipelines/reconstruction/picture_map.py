@@ -238,10 +238,7 @@ def features_of(picture: Picture, intrinsics: Intrinsics) -> KeyFeatures:
 def map_pictures(
     features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool = False
 ) -> PictureMap:
-    """Map key pictures by their features; NoAttitudesError: too few of them are in one map.
-
-    With `refine_focal` the focal length is a guess, and is refined if the pictures determine it.
-    """
+    """Map key pictures by their features, refining a guessed focal length; NoAttitudesError: too few."""
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value

@@ -638,10 +638,7 @@ _FILE_METADATA: dict[str, dict[str, Any]] = {
 def write_figures(
     folder: Path, figures: Sequence[Figure], contents: Mapping[str, SessionContent], key: str
 ) -> None:
-    """Write `<figure>.png`, `.svg`, `.pdf` and `.csv` of every figure into an empty folder, and the mark.
-
-    The mark names the flights of `contents` and holds `key`, which is equal for equal figures.
-    """
+    """Write each figure as .png, .svg, .pdf, .csv, and the mark with `key` and the flights of `contents`."""
     listed = []
     for figure in figures:
         names = [*write_drawing(folder, figure.key, figure), f"{figure.key}.csv"]

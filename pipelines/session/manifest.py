@@ -181,10 +181,7 @@ def option_names(part: str) -> list[str]:
 
 
 def options_of(place: str, part: str, format_: Format, stated: Mapping[str, object], wanted: type[O]) -> O:
-    """Validate the options beside a file by the model that its format has for a part of the manifest.
-
-    DataError if the format takes no such option, or not with this value; `place` names it in messages.
-    """
+    """Validate the options beside a file by its format's model for a part of the manifest; or DataError."""
     found = next((model for kind, model in _BY_KIND.get(part, ()) if isinstance(format_, kind)), NoOptions)
     allowed = set(getattr(format_, "choices", found.model_fields if found is not TelemetryChoice else ()))
     if strange := [name for name in stated if name not in allowed]:

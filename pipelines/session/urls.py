@@ -125,10 +125,7 @@ def media_path(base: Path, stated: str, session: Path) -> str:
 
 
 def fetched(url: str, *, fresh: bool = False) -> Path:
-    """Return the copy of a file or folder of a store; fetch it if it is missing or, if `fresh`, changed.
-
-    DataError if the store cannot be read, holds no such thing, or it does not fit on the disk.
-    """
+    """Return the copy of a file or folder of a store, fetched if missing or, if `fresh`, changed."""
     folder = _cache() / "sources" / _short(url)
     target, note = folder / url.rpartition("/")[2], folder.with_suffix(".json")
     with _own_disk(folder):

@@ -137,10 +137,7 @@ _WRINKLE_PER_M = 28.0
 
 @dataclass(frozen=True)
 class Outfit:
-    """Colours and lengths of clothes.
-
-    Colours are linear RGB reflectances. `sleeve` and `leg` say where they end, in places along a limb.
-    """
+    """Colours (linear RGB) of clothes, and where `sleeve` and `leg` end along a limb."""
 
     sleeve: float
     leg: float

@@ -354,10 +354,7 @@ class DronePoses:
 
 @dataclass(frozen=True)
 class PoseLog:
-    """The log of the estimator on board of one drone, row by row at the same stamps.
-
-    `gimbal_xyzw` is world_from_gimbal: with it, `body` and the lever arm `compose_gimbal` gives `camera`.
-    """
+    """The log of a drone's estimator, by stamp; body, `gimbal_xyzw` and lever arm give `camera`."""
 
     body: Trajectory
     gimbal_xyzw: Float  # [M, 4]

@@ -83,10 +83,7 @@ class Roll:
 
 
 def roll(run: float, before: float, after: float) -> Roll:
-    """Compute the roll of a foot; `run` is 0 for walking, 1 for running.
-
-    `before` and `after` are the lengths of the swings about the strike, as shares of a full stride's.
-    """
+    """Compute the roll of a foot (`run` 0 walks, 1 runs) between swings of shares of a full stride."""
 
     def mix(walk: tuple[tuple[float, float], ...], jog: tuple[tuple[float, float], ...]) -> list[list[float]]:
         mixed: list[list[float]] = ((1 - run) * np.array(walk) + run * np.array(jog)).tolist()
@@ -477,10 +474,7 @@ class Plan:
         self._step_through(stretch, knots, first=RIGHT)
 
     def run_up(self, parts: Sequence[WayPart], speeds: Pace, plant_s: float, foot: int) -> None:
-        """Run so that `foot` strikes `plant_s` after the start, and take no step after that one.
-
-        The caller plans the rest of the steps and sets the time.
-        """
+        """Run so that `foot` strikes `plant_s` after the start, its last step; the caller plans the rest."""
         stretch = self._along(parts, speeds)
         knots = [knot for knot in speeds if knot[0] <= plant_s + 1e-9]
         count = max(2, round(float(self._phase(knots, 0.0)(np.array(plant_s)))))

@@ -162,10 +162,7 @@ def exact_keypoints(of: Walk, seen_by: CameraFormation) -> SimulatedKeypoints:
 def model_keypoints(
     of: Walk, seen_by: CameraFormation, exact: SimulatedKeypoints, *, seed: int, trial: int
 ) -> SimulatedKeypoints:
-    """Simulate the keypoints of a detector with measured errors (`detector_errors`).
-
-    The errors grow with tilt. They include joints that the body itself hides; there are no obstacles.
-    """
+    """Simulate a detector's keypoints with measured errors, which grow with tilt (`detector_errors`)."""
     found = []
     for camera, pixels in enumerate(exact.xy):
         tilt_deg, height_px = view_of(

@@ -27,10 +27,7 @@ from pipelines.simulation.raster import TriangleSurface, joined
 
 @dataclass(frozen=True)
 class MoundedGround:
-    """Mounds over z = 0: height = sum of h exp(-(a^2 + b^2) / 2).
-
-    a and b are the distances from a mound's centre along its yawed axes, in its sigmas.
-    """
+    """Mounds h exp(-(a^2 + b^2) / 2) over z = 0, in sigmas a and b along their yawed axes."""
 
     mounds: Float  # [M, 7]
 

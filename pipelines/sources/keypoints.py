@@ -35,10 +35,7 @@ def without_zeros(detections: Detections) -> Detections:
 
 
 def in_pixels(detections: Detections, intrinsics: Intrinsics, source: str) -> Detections:
-    """Turn coordinates that are shares of the picture (0 to 1) into pixels; count them as adjusted.
-
-    DataError: the coordinates count from the middle of the picture.
-    """
+    """Turn shares of the picture (0 to 1) into pixels, adjusted; DataError: from the picture's middle."""
     known = detections.xy[np.isfinite(detections.xy)]
     if not len(known) or np.abs(known).max() > _MAX_SHARE:
         return detections

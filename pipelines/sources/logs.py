@@ -168,10 +168,7 @@ class FlightLogs:
 
     @contextmanager
     def open(self, log: str) -> Iterator[FlightLog]:
-        """Open a recording for one reading.
-
-        DataError: a file is missing, damaged beyond use, or no log.
-        """
+        """Open a recording for one reading; DataError: a file is missing, damaged, or no log."""
         paths = tuple(self.paths(log))
         recording: Log | None = self._kept.pop(paths, None)
         if recording is None:
@@ -199,10 +196,7 @@ class FlightLogs:
     def trajectory(
         self, log: str, topic: str | None, parent: str | None, child: str | None, *, max_gap_ns: int
     ) -> Trajectory:
-        """Read poses in the log's own world and axes, at world times.
-
-        DataError: no such topic or frame, several candidates, or nothing usable.
-        """
+        """Read poses in the log's own axes, at world times; DataError: several or nothing usable."""
         with self.open(log) as opened:
             recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
             if parent is not None and child is not None:
@@ -249,10 +243,7 @@ class FlightLogs:
             return opened.at_world_times(gathered)
 
     def intrinsics(self, log: str, topic: str | None) -> Intrinsics:
-        """Return the intrinsics of a topic of camera infos; messages that are not calibrated are left out.
-
-        DataError: no such topic, or none of it is calibrated, or its calibration changes in flight.
-        """
+        """Return a topic's calibrated intrinsics; DataError: none is, or it changes in flight."""
         found: dict[Intrinsics, str] = {}
         count = 0
         with self.open(log) as opened:
@@ -278,10 +269,7 @@ class FlightLogs:
         return next(iter(found))
 
     def frames(self, log: str, topic: str | None) -> Frames:
-        """Read the times at which the pictures of a topic were taken, at world times.
-
-        DataError: no such topic, or no picture in it.
-        """
+        """Read the times at which a topic's pictures were taken, at world times; DataError: none."""
         with self.open(log) as opened:
             name = opened.choose("pictures", topic)
             taken_ns, received_ns = picture_stamps(opened.recording, name, opened.source)
@@ -299,10 +287,7 @@ class FlightLogs:
             return Frames(name, opened.world_times(t_ns), dict(lost))
 
     def picture_size(self, log: str, topic: str | None) -> tuple[int, int] | None:
-        """Return width and height of a topic's pictures, from the first readable one; None without any.
-
-        DataError: no such topic.
-        """
+        """Return width and height of a topic's pictures, from the first readable one; None without any."""
         with self.open(log) as opened:
             name = opened.choose("pictures", topic)
             for sample in all_samples(opened.recording.messages([name]), opened.source):

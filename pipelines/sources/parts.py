@@ -100,10 +100,7 @@ def camera_entry(
     axes: tuple[Axes, Axes],
     note: Callable[[str], None],
 ) -> CameraEntry:
-    """Describe a camera for session.json; note doubts about its poses, and losses, one line each.
-
-    `axes` are those that its poses are in, and those of its gimbal's angles. DataError: no frame has a pose.
-    """
+    """Describe a camera for session.json, and note doubts and losses; DataError: no frame has a pose."""
     frames = data.frames
     entry = CameraEntry(
         intrinsics=data.intrinsics,
@@ -264,10 +261,7 @@ def span_words(first_ns: int, last_ns: int) -> str:
 
 
 def refuse_no_overlap(source: Path | str, t_ns: Int64, entries: Mapping[str, CameraEntry]) -> None:
-    """Refuse data that share no time with the pictures.
-
-    DataError: all times [N] are before or after the pictures of all cameras.
-    """
+    """Refuse times [N] that are all before or all after the pictures of all cameras."""
     first, last = span_of_pictures(entries)
     if t_ns[0] > last or t_ns[-1] < first:
         problem = f"spans {span_words(t_ns[0], t_ns[-1])}, the pictures {span_words(first, last)}"

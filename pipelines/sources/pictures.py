@@ -36,10 +36,7 @@ class CameraPictures(Protocol):
 
 @contextmanager
 def open_pictures(session: Path, description: Description, camera: str) -> Iterator[CameraPictures]:
-    """Open the pictures that a session was made from; check before and after that they did not change.
-
-    DataError: they are missing, differ from those that were ingested, or cannot be read.
-    """
+    """Open the pictures of a session; DataError: missing, unreadable, or other ones, also at the end."""
     media = _media(description, camera)
     refuse_changed_pictures(session, description, [camera])
     paths = [located(session, path) for path in media.paths]
@@ -56,10 +53,7 @@ def open_files(paths: list[Path], topic: str | None, stamps: str) -> CameraPictu
 
 
 def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:
-    """Refuse, with a DataError, pictures with other content than those that were ingested.
-
-    A file with the noted size and time of change is the same; any other is hashed. Missing files pass.
-    """
+    """Refuse pictures with another content than was ingested, by size and time or hash; missing pass."""
     noted = noted_stamps(session, description.sources)
     for camera in cameras:
         media = _media(description, camera)
@@ -88,10 +82,7 @@ def _media(description: Description, camera: str) -> MediaEntry:
 
 
 class LoggedPictures:
-    """Pictures of a topic, numbered as in ingest; reading forward is cheap, reading backward restarts.
-
-    DataError: the log cannot be opened, or the encoding of its pictures is unknown.
-    """
+    """Pictures of a topic, numbered as in ingest; reading backward restarts. DataError: cannot be read."""
 
     def __init__(self, paths: list[Path], topic: str, stamps: str) -> None:
         self._source = paths[0]

@@ -542,10 +542,7 @@ class FlightPoses:
         return self._read(camera.pose).fit if self._is_joined(camera.pose) else None
 
     def triggers(self, camera: CameraSources) -> Int64 | None:
-        """Read the trigger times of pictures from a drone's own log, at world times; None if it is none.
-
-        Of a log that holds the camera's poses, too, they are of the same vehicle and clock.
-        """
+        """Read a drone's own log's trigger times of pictures, at world times; None if it is none."""
         times, choice = camera.frame_times or FrameTimes(), TelemetryChoice()
         stated, reader = times.file, self._files.format_of("frame_times", times)
         if not isinstance(reader, TriggerFormat):

@@ -53,10 +53,7 @@ def upright(world: WorldAxes) -> Placement:
 
 
 def as_stated(trajectory: Trajectory, pose: PoseSource, options: FiledPose) -> Trajectory:
-    """Return poses world_from_camera (or body) in metres, of a file that has them as the manifest states.
-
-    Covariances of inverted poses are left out: they are those of another pose.
-    """
+    """Return poses as the manifest states them, in metres; inverted ones lose their covariances."""
     if options.quaternion == "wxyz":
         trajectory = replace(trajectory, quaternion_xyzw=np.roll(trajectory.quaternion_xyzw, -1, axis=-1))
     if options.inverse:
@@ -186,10 +183,7 @@ def _crs(name: str) -> Any | None:
 
 
 class Projection:
-    """One CRS, of positions x east (or longitude), y north (or latitude) and height.
-
-    DataError: pyproj is missing, or the CRS is unknown or no projected or geographic one.
-    """
+    """One CRS, of east (or longitude), north (or latitude), height; DataError: it is not usable."""
 
     def __init__(self, name: str, place: str) -> None:
         pyproj: Any = need("pyproj", "places")
@@ -213,18 +207,12 @@ class Projection:
         return bool(in_longitude and area.south <= latitude <= area.north)
 
     def first_place(self, source: Path | str, position: Float) -> Place:
-        """Return the place on Earth of the first position [N, 3].
-
-        DataError: it lies outside the CRS.
-        """
+        """Return the place on Earth of the first position [N, 3]; DataError: outside the CRS."""
         latitude, longitude, height = self._geodetic(source, position[:1])[0].tolist()
         return Place(latitude, longitude, height)
 
     def points(self, source: Path | str, position: Float, origin: Place) -> Float:
-        """Convert positions [..., 3] to metres east, north and up of the origin; NaN stays NaN.
-
-        DataError: none of them lies inside the CRS.
-        """
+        """Convert [..., 3] to metres east, north, up of the origin, NaN stays; DataError: outside."""
         flat = position.reshape(-1, 3)
         latitude, longitude, height = self._geodetic(source, flat).T
         return enu_from_geodetic(latitude, longitude, height, origin).reshape(position.shape)

@@ -71,10 +71,7 @@ def note_no_skeleton(recording: Recording, export: str) -> None:
 
 
 def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:
-    """Compute half axes [..., 3] in m and world_from_axes quaternions [..., 4] of 95 % ellipsoids.
-
-    `covariance` is [..., 6] m^2, the upper triangle by rows; NaN gives NaN.
-    """
+    """Compute half axes [..., 3] m and world_from_axes [..., 4] of 95 % ellipsoids of [..., 6] m^2."""
     full = full_covariance(covariance)
     known = np.isfinite(full).all(axis=(-2, -1))
     half = np.full((*known.shape, 3), np.nan)

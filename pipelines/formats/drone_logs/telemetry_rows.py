@@ -124,10 +124,7 @@ def attitude_track(
     *,
     stated: Mapping[RelativeTo, Float] | None = None,
 ) -> AttitudeTrack | None:
-    """Drop the attitudes that cannot be used, counted as "attitude ..."; return None if none is left.
-
-    `quaternion_xyzw` [N, 4] are of an FLU body or gimbal in an ENU world; `stated` as in `AttitudeTrack`.
-    """
+    """Drop unusable attitudes [N, 4] (FLU in ENU), counted as "attitude ..."; return None without any."""
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quaternion_xyzw, axis=1)
         causes: dict[str, Bool] = {

@@ -81,10 +81,7 @@ class TlogFormat(DroneLog):
     choices: tuple[str, ...] = ("position", "instance", "time")
 
     def recognises(self, path: Path) -> bool:
-        """Return True if it begins with three packets behind plausible times.
-
-        If its name says that it is one, they may stand behind some damage.
-        """
+        """Return True if it begins with three packets behind plausible times, by its name after damage."""
         if _are_packets(first_bytes(path, 1024), 0):
             return True
         head = first_bytes(path, _SEARCHED, suffixes=self.suffixes)

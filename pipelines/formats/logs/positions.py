@@ -53,10 +53,7 @@ def pairs_of(topics: Sequence[Topic]) -> list[tuple[str, str]]:
 def read_pair(
     recording: Log, source: str, position: str, attitude: str | None, axes: Axes, stamps: Stamps
 ) -> Telemetry:
-    """Read a topic of positions (`FIXES`, PointStamped) and one of attitudes (Imu, QuaternionStamped).
-
-    Axes are those of attitudes, and of positions in metres.
-    """
+    """Read topics of positions (`FIXES`, PointStamped) and attitudes (Imu, QuaternionStamped) as a pair."""
     counts = {topic.name: topic.count for topic in recording.topics}
     for name in filter(None, (position, attitude)):
         if not counts.get(name):

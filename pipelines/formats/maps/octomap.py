@@ -98,10 +98,7 @@ def occupancy_from(
 
 
 def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str) -> Leaves:
-    """Find the leaves of a tree without a header, as in octomap_msgs/Octomap.
-
-    `payload` are the bytes behind the header of a .bt (`is_binary`, one for all kinds of trees) or a .ot.
-    """
+    """Find the leaves of the bytes behind the header of a .bt (`is_binary`) or .ot, as octomap_msgs has."""
     if is_binary:
         return binary_leaves(source, payload)
     if tree not in _RECORD_BYTES:

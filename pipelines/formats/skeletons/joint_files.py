@@ -62,10 +62,7 @@ _UNITS = {
 
 
 def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float:
-    """Convert positions [..., 3]; a point with a coordinate that is not finite is missing (all NaN).
-
-    y-up files (OpenSim, TRC) turn into world = (z, x, y).
-    """
+    """Convert positions [..., 3], of y-up files to (z, x, y); not finite in part is missing (all NaN)."""
     if unit not in METRES:
         problem = f"the unit {unit!r} is none of {', '.join(METRES)}"
         raise DataError(source, problem, "state `unit: mm` or alike", code="unit-unknown")

@@ -79,10 +79,7 @@ def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:
 def mount(
     cameras: Sequence[Filmed], group: Sequence[int], *, before: Float = _EYE, after: Float = _EYE
 ) -> str:
-    """Turn body_from_camera [3, 3] of cameras in the body's or the camera's axes.
-
-    Of a camera without a mount, state what turns its pose.
-    """
+    """Turn body_from_camera [3, 3] of cameras in either's axes; without a mount what turns the pose."""
 
     def said(camera: Filmed) -> str:
         stored = camera.entry.poses.mount or camera.entry.poses.in_gimbal

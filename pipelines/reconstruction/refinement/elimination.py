@@ -110,10 +110,7 @@ def covariances(system: System, at: Eliminated) -> Float:
 
 
 def moments(system: System, state: State, at: Eliminated, *, every: int) -> Moments:
-    """Compute the moments for the estimate of levels, using the pictures of every k-th time.
-
-    Covariances are those of the eliminated state, squares those of `state`, one step further.
-    """
+    """Compute the moments of levels, using every k-th time: squares of `state`, one step further."""
     return _visit(system, state, at, np.zeros((0, 1, 3, 3)), every)
 
 

@@ -92,10 +92,7 @@ class Linearised(NamedTuple):
 
 @helper
 def exponential(rotation_vector: Float, rotation: Float, jacobian: Float) -> None:
-    """Compute exp(r) [3, 3] and its left Jacobian: exp(r + dr) = exp(J dr) exp(r).
-
-    Source: Barfoot 2017, 7.77 and 7.85.
-    """
+    """Compute exp(r) [3, 3] and its left Jacobian (Barfoot 2017, 7.77 and 7.85)."""
     angle2 = rotation_vector[0] ** 2 + rotation_vector[1] ** 2 + rotation_vector[2] ** 2
     if angle2 < 1e-8:
         a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
@@ -222,10 +219,7 @@ def linearise(
 
 @helper
 def confidence_of(squared: float, bound2: float) -> float:
-    """Compute a view's weight from its whitened squared residual: 1 within the bound, redescending beyond.
-
-    The loss is bounded (below 2 bound2), so that far outliers have no influence.
-    """
+    """Weigh a view by its whitened squared residual: 1 within the bound, then less: bounded in its loss."""
     if not squared > bound2:
         return 1.0
     return (bound2 / squared) ** 2
@@ -559,10 +553,7 @@ def whiten(equations: Equations, step: State) -> None:
 
 @cached
 def misfit(equations: Equations, first: int, total: float, residuals: Float, numbers: Float) -> float:
-    """Add the loss of G pictures from `first` on to a total.
-
-    Fill their whitened residuals [G, J, 2] (NaN unseen) and numbers [G, 10].
-    """
+    """Add the loss of G pictures to a total; fill whitened residuals [G, J, 2] and numbers [G, 10]."""
     t_s, state, pictures, entries, bound2, _ = equations
     picture = linearised(state.position.shape[1])
     residual = picture.residual

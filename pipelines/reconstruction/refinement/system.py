@@ -364,10 +364,7 @@ def _ties(layout: UnknownLayout) -> tuple[Float, Float]:
 
 
 def misfit(system: System, state: State) -> tuple[float, Float, Float]:
-    """Compute the loss of the pictures, whitened residuals [G, J, 2], and each picture's numbers [G, 10].
-
-    Residuals are NaN, and cost nothing, for joints that were not seen or lie behind the camera.
-    """
+    """Compute the pictures' loss, whitened residuals [G, J, 2] (NaN unseen) and numbers [G, 10]."""
     residual = np.empty(system.pictures.rays.shape)
     numbers = np.empty((len(residual), kernels.NUMBERS))
     equations = system.equations(state)
