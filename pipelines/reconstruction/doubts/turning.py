@@ -136,17 +136,11 @@ def lateness(
     factors: Sequence[float],
     first_ns: Sequence[int] | None = None,
 ) -> list[Lateness]:
-    """Find the clocks and the frame rates, of all cameras and of each, by which the turns fit best.
+    """Find the clocks and frame rates, of all cameras and of each, by which the turns fit best; best first.
 
-    Args:
-        cameras: of the flight.
-        turns: of those of them whose backgrounds were followed, by index.
-        between: how poses are interpolated.
-        factors: between the times of pictures that are tried.
-        first_ns: the first picture of each camera; by default the first of those that were looked at.
-
-    Returns:
-        The largest gain first; none if too little turns, or the logs turn otherwise at all times.
+    Turns are by camera; `factors` of the times between pictures are tried, from `first_ns` on (by default the
+    first picture that was looked at). None is returned if too little turns, or the logs turn otherwise at all
+    times.
     """
     known = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
     starts = [int(each.frame_t_ns[0]) for each in cameras] if first_ns is None else first_ns
@@ -166,17 +160,7 @@ def lateness(
 def common_offset(
     cameras: Sequence[Camera], followed: Mapping[str, object], between: Interpolation
 ) -> Lateness | None:
-    """Estimate the clock offset that all cameras share, from the turning of their backgrounds.
-
-    Args:
-        cameras: of the flight, after the offsets between them were corrected.
-        followed: tracks of the backgrounds by camera; values of other types are ignored.
-        between: interpolation of the poses.
-
-    Returns:
-        None if the cameras turn too little, if the logs turn differently at every offset, or if the estimate
-        is not significant (`is_sure_clock`).
-    """
+    """Estimate the clock offset that all cameras share by their backgrounds; None if it is not sure."""
     turns = all_turns(cameras, followed)
     turns = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
     late = None

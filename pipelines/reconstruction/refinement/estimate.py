@@ -173,15 +173,7 @@ _LEAST_RATE = (1e-4, 1e-5)
 
 
 def reestimated(system: System, state: State, at: Eliminated, *, poses: bool, motion: bool) -> Knowledge:
-    """Estimate the prior's parameters again from the posterior at `state`.
-
-    Args:
-        system: the problem with the parameters so far.
-        state: the estimate with them.
-        at: the equations that it solves.
-        poses: True to estimate the levels of pose errors, pooled over the cameras.
-        motion: True to estimate those of motion, bones and keypoints.
-    """
+    """Estimate the prior's parameters again from the posterior: of `poses`, pooled, and of `motion`."""
     known = system.knowledge
     found = moments(system, state, at, every=_EVERY)
     if poses:

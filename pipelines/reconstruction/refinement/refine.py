@@ -138,15 +138,10 @@ def refine(
 ) -> Refined:
     """Estimate a skeleton, its cameras' pose errors and clocks together (maximum a posteriori).
 
-    Args:
-        t_s: [T] the skeleton's times, strictly increasing.
-        sightings: keypoints and poses of each of C cameras, J joints.
-        start: [T, J, 3] m, from a triangulation that trusts the poses; NaN where it found nothing.
-        bones: [B, 2] pairs of joints with a nearly constant distance; without any, the first two joints.
-        prior: prior of each camera's pose errors; None without stated noise.
-        clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
-        measured: True if the prior was measured. If another one does not explain the pictures, the levels are
-            estimated.
+    Times [T] strictly increase; `start` [T, J, 3] m is by a triangulation that trusts the poses, NaN where it
+    found nothing; `bones` [B, 2] are pairs of joints with a nearly constant distance; `clock_sigma_s` [C] is
+    0 for a known clock. Where a `prior` that was not `measured` does not explain the pictures, levels are
+    estimated.
     """
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
