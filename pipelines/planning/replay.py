@@ -307,8 +307,9 @@ MIN_ACCELERATION_MPS2 = 0.1
 MIN_SMOOTHED_TIMES = 4
 # What all joints share is not farther off than this, even where no view tells it.
 FARTHEST_M = 100.0
-# This much information (1/m^2), and share of the stiffness, keeps equations solvable without measurements.
+# This much information (1/m^2) keeps equations solvable where nothing was measured.
 LEAST_INFORMATION = 1e-6
+# And so does this share of the stiffness, where that is larger.
 LEAST_OF_STIFFNESS = 1e-10
 # Keypoints below this confidence are left out, as in `mocap reconstruct`.
 MIN_CONFIDENCE = 0.3

@@ -42,7 +42,8 @@ UNMEASURED: Colour = (209, 205, 201)
 GREY = 96
 _DARK: Colour = (0, 0, 0)
 _PAPER: Colour = (255, 255, 255)
-_FILLED = -1  # cv2.FILLED
+# OpenCV fills circles of this thickness.
+_FILLED = -1
 
 # A bone is 2 px wide in a picture of 1280 x 720, and other marks follow it.
 BONE_OF_DIAGONAL = 1 / 700
