@@ -163,7 +163,7 @@ def reconstruct_command(
     if not shown.quiet:
         _print(result, every_joint=shown.verbose)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
-    if not shown.quiet and "verdict" in result.metrics:  # unless an earlier version wrote it
+    if not shown.quiet:
         print_verdict(result.metrics["verdict"], result.folder)
     return None
 

@@ -15,7 +15,7 @@ from pipelines.session.manifest import Manifest, read_flight
 from pipelines.session.recognition import EXPECTED, describe_unknown, refuse_pointers
 from pipelines.session.registries import FORMATS
 from pipelines.session.stages import STAGES, open_session, outdated
-from pipelines.session.storage import SCHEMA, SIMULATION_MARK, STUDY_MARK, read_json, refuse_special
+from pipelines.session.storage import SIMULATION_MARK, STUDY_MARK, read_json, refuse_newer, refuse_special
 from pipelines.session.yaml_models import YamlModel, keys_of
 from pipelines.simulation.scenario import Scenario, read_scenario
 
@@ -110,10 +110,7 @@ def _of_summary(path: Path) -> Survey | None:
 def _described(
     file: Path, summary: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], dict[str, Any]]
 ) -> dict[str, Any]:
-    schema = summary.get("schema")
-    if isinstance(schema, int) and schema > SCHEMA:
-        problem = f"has schema {schema}, newer than {SCHEMA}"
-        raise DataError(file, problem, "update mocap to read it", code="newer-schema")
+    refuse_newer(file, summary, "make the folder again")
     try:
         return reader(summary)
     except (KeyError, TypeError, AttributeError):

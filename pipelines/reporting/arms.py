@@ -79,11 +79,6 @@ class MapAround:
     resolution_m: float
     ground_m: float  # world
 
-    @property
-    def tops(self) -> Int64:
-        """Voxels [X, Y] from the grid's floor to the top of each column's highest occupied one."""
-        return _tops(self.occupied)
-
 
 @dataclass(frozen=True)
 class Heights:
@@ -116,13 +111,14 @@ def map_around(occupancy: Occupancy, low: Float, high: Float) -> MapAround | Non
 
 
 def _tops(occupied: NDArray[np.bool_]) -> Int64:
+    """Count voxels [X, Y] from the grid's floor to the top of each column's highest occupied one."""
     tops: Int64 = occupied.shape[2] - occupied[:, :, ::-1].argmax(axis=2).astype(np.int64)
     return tops
 
 
 def heights(around: MapAround) -> Heights:
     """Compute heights on a coarse grid: each cell has that of its highest column."""
-    above_m = around.corner[2] + around.resolution_m * around.tops - around.ground_m
+    above_m = around.corner[2] + around.resolution_m * _tops(around.occupied) - around.ground_m
     above_m = np.where(around.occupied.any(axis=2), np.maximum(above_m, 0.0), 0.0)
     step = -(-max(above_m.shape) // MAX_TOP_CELLS)
     east, north = (np.arange(0, side, step) for side in above_m.shape)

@@ -565,9 +565,9 @@ def points_at(path: Float, colour: str, name: str = "", **style: Any) -> Points:
     return Points(path[:, 0], path[:, 1], colour, name, **style)
 
 
-def stride_for(count: int, most: int = MOST_POINTS) -> int:
-    """Return the stride that leaves at most `most` of `count`."""
-    return max(1, -(-count // most))
+def stride_for(count: int) -> int:
+    """Return the stride that leaves at most `MOST_POINTS` of `count`."""
+    return max(1, -(-count // MOST_POINTS))
 
 
 def bounds(paths: Sequence[Float]) -> tuple[Float, Float]:

@@ -91,16 +91,14 @@ def whole(value: float | None) -> str:
     return fixed(value, 0)
 
 
-def significant(value: float | None, digits: int = 3) -> str:
-    """Format a number with about `digits` significant digits, never in powers of ten above 0.001."""
-    if value is None:
-        return ABSENT
+def significant(value: float) -> str:
+    """Format a number with about three significant digits, never in powers of ten above 0.001."""
     if value == 0:
         return "0"
     if not 1e-3 <= abs(value) < 1e9:
-        return f"{value:.{digits}g}".replace("-", "−")
+        return f"{value:.3g}".replace("-", "−")
     before = len(str(int(abs(value)))) if abs(value) >= 1 else 0
-    return fixed(value, max(digits - max(before, 1), 0))
+    return fixed(value, max(3 - max(before, 1), 0))
 
 
 def quantity(value: float | None, unit: str, digits: int = 1) -> str:

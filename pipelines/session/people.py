@@ -171,14 +171,11 @@ def skeleton_with(count: int) -> tuple[Skeleton, ...]:
     return tuple(skeleton for skeleton in SKELETONS.values() if len(skeleton.joints) == count)
 
 
-def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...], axis: int = -2) -> Float:
-    """Select the `wanted` joints along an axis of [..., J, ...], in their order; NaN for absent ones."""
+def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...]) -> Float:
+    """Select the `wanted` joints of [..., J, D], in their order; NaN for absent ones."""
     column = {joint: index for index, joint in enumerate(joints)}
     source = np.array([column.get(joint, -1) for joint in wanted], dtype=np.int64)
-    by_joint = np.moveaxis(values, axis, 0)
-    taken = np.full((len(wanted), *by_joint.shape[1:]), np.nan)
-    taken[source >= 0] = by_joint[source[source >= 0]]
-    return np.moveaxis(taken, 0, axis)
+    return np.where((source < 0)[:, None], np.nan, values[..., source, :])
 
 
 def with_derived(joints: tuple[str, ...], position: Float) -> tuple[tuple[str, ...], Float]:

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
-from pipelines.formats.skeletons.joint_files import joint_names
+from pipelines.formats.skeletons.joint_files import METRES, joint_names
 from pipelines.formats.videos.frame_times import FrameTimesFormat
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import (
@@ -44,7 +44,7 @@ from pipelines.session.registries import (
 from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
 from pipelines.session.urls import fetched, located, named, source_url
 from pipelines.session.yaml_models import YamlModel
-from pipelines.sources.world import METRES, UP_ROWS, losses
+from pipelines.sources.world import UP_ROWS, losses
 
 # In any flight a person's joints are closer to their median than this.
 MAX_JOINT_DISTANCE_M = 10_000

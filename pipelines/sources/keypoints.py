@@ -1,5 +1,6 @@
 """Checks of keypoints that came with the flight: what cannot be pixels of this picture, or of its time."""
 
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -91,27 +92,17 @@ def doubt_numbers(detections: Detections, frames: CameraFrames, *, from_video: b
 
 def unmirrored(detections: Detections, mirrored: bool | str, intrinsics: Intrinsics) -> Detections:
     """Undo mirrored pictures: True; "x" alone counts from the right, "y" from below; "names" swap."""
+    xy, confidence, joints = detections.xy.copy(), detections.confidence, detections.joints
     if mirrored in (True, "x"):
-        xy = detections.xy.copy()
         xy[..., 0] = intrinsics.width - 1 - xy[..., 0]
-        detections = replace(detections, xy=xy)
     if mirrored == "y":
-        xy = detections.xy.copy()
         xy[..., 1] = intrinsics.height - 1 - xy[..., 1]
-        detections = replace(detections, xy=xy)
     if mirrored in (True, "names"):
-        order = [detections.joints.index(_other_side(name, detections.joints)) for name in detections.joints]
-        detections = replace(
-            detections, xy=detections.xy[:, order], confidence=detections.confidence[:, order]
-        )
-    return detections
-
-
-def _other_side(name: str, joints: tuple[str, ...]) -> str:
-    """Return the name of the same joint on the other side; its own if there is none."""
-    other = {"left": "right", "right": "left"}.get(name.partition("_")[0])
-    opposite = f"{other}_{name.partition('_')[2]}" if other else name
-    return opposite if opposite in joints else name
+        sides = {"left_": "right_", "right_": "left_"}
+        others = [re.sub("^(left|right)_", lambda side: sides[side[0]], name) for name in joints]
+        order = [joints.index(other) if other in joints else k for k, other in enumerate(others)]
+        xy, confidence = xy[:, order], confidence[:, order]
+    return replace(detections, xy=xy, confidence=confidence)
 
 
 def near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:

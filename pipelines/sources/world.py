@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.maps.voxel_grids import placed
+from pipelines.formats.skeletons.joint_files import METRES
 from pipelines.geometry.arrays import Float, Int64, Place
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import FLU_FROM_FRD, body_from_camera
@@ -27,7 +28,6 @@ from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import need
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 
 # No drone flies so far from the origin, and eastings of UTM begin at 166 km.
 MAX_DISTANCE_M = 100_000.0

@@ -1,7 +1,6 @@
 """Positions and attitudes in separate topics of a log, and axes that known programs give their poses."""
 
 import re
-from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os.path import commonpath
@@ -11,6 +10,7 @@ import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import attitude_track, position_track
 from pipelines.formats.logs.messages import FAULTS, LoggedRows, Stamps, nanoseconds, unreadable
+from pipelines.formats.logs.trajectories import Samples
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes
@@ -107,25 +107,19 @@ def read_positions(
 
 
 def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> LoggedRows:
-    header_ns, receive_ns, values = array("q"), array("q"), array("d")
+    gathered, row = Samples(), list[float]()
     for message in recording.messages([topic]):
         value = message.value
         try:
             header = getattr(value, "header", None)
             stamp = getattr(value, "timestamp", None) if header is None else header.stamp
             row = [float(number) for number in numbers(value)]
-            header_ns.append(0 if stamp is None else nanoseconds(stamp))
-            receive_ns.append(message.receive_ns)
-            values.extend(row)
+            gathered.add(0 if stamp is None else nanoseconds(stamp), message.receive_ns, row)
         except FAULTS as error:
             raise unreadable(message, source, error) from error
-    if not len(header_ns):
+    if not row:
         raise DataError(source, f"topic {topic} holds no message", "name another")
-    return LoggedRows(
-        np.frombuffer(header_ns, np.int64),
-        np.frombuffer(receive_ns, np.int64),
-        np.frombuffer(values, np.float64).reshape(len(header_ns), -1),
-    )
+    return gathered.rows(len(row))
 
 
 def _point_of(value: Any) -> Sequence[float]:

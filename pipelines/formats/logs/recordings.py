@@ -386,11 +386,9 @@ class OpenLog:
         for part in self.parts:
             part.forget()
 
-    def messages(
-        self, topics: Collection[str], *, first_ns: int = -(2**63), last_ns: int = 2**63 - 1
-    ) -> Iterator[Message]:
-        """Yield the messages of some topics received from `first_ns` to `last_ns`, in that order."""
-        streams = [self._of_part(part, frozenset(topics), first_ns, last_ns) for part in self.parts]
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of some topics in the order of their receipt."""
+        streams = [self.messages_of(part, topics) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
     def describe(self) -> dict[str, object]:
@@ -449,9 +447,8 @@ class OpenLog:
             later.received_ns = later.received_ns - step_ns
         self._topics = {key: self._summary(*key) for key in self._topics}
 
-    def _of_part(
-        self, part: LogPart, topics: frozenset[str], first_ns: int, last_ns: int
-    ) -> Iterator[Message]:
+    def messages_of(self, part: LogPart, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of some topics in one part, in the order of their receipt."""
         decoders = {}
         for number, channel in part.channels.items():
             if channel.topic in topics:
@@ -460,8 +457,6 @@ class OpenLog:
                 except ValueError:
                     part.lose(part.rows_of([number]), UNDEFINED)
         rows = part.rows_of(decoders)
-        received_ns = part.received_ns[rows]
-        rows = rows[(received_ns >= first_ns) & (received_ns <= last_ns)]
         for start in range(0, len(rows), _BATCH):
             batch = rows[start : start + _BATCH]
             stamps = part.received_ns[batch].tolist()

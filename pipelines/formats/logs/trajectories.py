@@ -68,7 +68,7 @@ class TransformLog:
     static: Mapping[Edge, LoggedRows]
 
 
-class _Samples:
+class Samples:
     """Samples of one body, gathered into flat arrays."""
 
     def __init__(self) -> None:
@@ -77,15 +77,15 @@ class _Samples:
         self._values = array("d")
         self._covariances = array("d")
 
-    def add(self, sample: PoseSample | AngleSample, values: Iterable[float]) -> None:
+    def add(self, header_ns: int, receive_ns: int, values: Iterable[float]) -> None:
         """Add one sample; the number of values must always be the same."""
-        self._header_ns.append(sample.stamp_ns)
-        self._receive_ns.append(sample.receive_ns)
+        self._header_ns.append(header_ns)
+        self._receive_ns.append(receive_ns)
         self._values.extend(values)
 
     def add_pose(self, pose: PoseSample) -> None:
         """Add one pose; either all poses have a covariance or none."""
-        self.add(pose, pose.position + pose.quaternion_xyzw)
+        self.add(pose.stamp_ns, pose.receive_ns, pose.position + pose.quaternion_xyzw)
         if pose.covariance is not None:
             self._covariances.frombytes(pose.covariance.tobytes())
 
@@ -115,7 +115,7 @@ def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gath
 
 def logged_poses(samples: Iterable[Sample], source: Source) -> LoggedRows:
     """Gather the poses of one body."""
-    gathered = _Samples()
+    gathered = Samples()
     frames: Edge | None = None
     for sample in samples:
         if not isinstance(sample, PoseSample):
@@ -141,13 +141,13 @@ def attitudes_of(
 
     `order` and `units` are those of angles (`attitude_from_angles`), ignored for quaternions.
     """
-    gathered, of_angles = _Samples(), False
+    gathered, of_angles = Samples(), False
     for sample in samples:
         if not isinstance(sample, AngleSample):
             problem = "holds no gimbal angles"
             raise DataError(source, problem, "name a topic of angles or quaternions", code="no-attitude")
         of_angles = sample.angles is not None
-        gathered.add(sample, sample.angles or sample.quaternion_xyzw or ())
+        gathered.add(sample.stamp_ns, sample.receive_ns, sample.angles or sample.quaternion_xyzw or ())
     rows = gathered.rows(3 if of_angles else 4)
     quaternion = rows.values
     if of_angles:
@@ -314,13 +314,13 @@ def _are_connected(transforms: TransformLog, parent: str, child: str) -> bool:
 
 
 def _by_edge(samples: Iterable[Sample], source: Source) -> dict[Edge, LoggedRows]:
-    by_edge: dict[Edge, _Samples] = {}
+    by_edge: dict[Edge, Samples] = {}
     for sample in samples:
         if not isinstance(sample, PoseSample):
             raise DataError(source, "holds no transforms", "name a topic of transforms")
         # ROS 1 wrote frames with and without a leading slash.
         edge = (sample.target.lstrip("/"), sample.source.lstrip("/"))
-        by_edge.setdefault(edge, _Samples()).add_pose(sample)
+        by_edge.setdefault(edge, Samples()).add_pose(sample)
     return {edge: gathered.rows(7) for edge, gathered in by_edge.items()}
 
 
@@ -398,11 +398,11 @@ def _written_bodies(log: OpenLog, part: LogPart) -> list[LoggedRows]:
         return []
     name = max(topics, key=lambda topic: topic.count).name
     received_ns, part.received_ns = part.received_ns, np.arange(len(part.received_ns))
-    bodies: dict[Edge, _Samples] = {}
+    bodies: dict[Edge, Samples] = {}
     try:
-        for sample in all_samples(log.messages([name], last_ns=len(received_ns)), "log"):
+        for sample in all_samples(log.messages_of(part, [name]), "log"):
             if isinstance(sample, PoseSample):
-                bodies.setdefault((sample.target, sample.source), _Samples()).add_pose(sample)
+                bodies.setdefault((sample.target, sample.source), Samples()).add_pose(sample)
     finally:
         part.received_ns = received_ns
         log.forget()

@@ -157,14 +157,6 @@ def created_ns(path: Path) -> int | None:
     return None
 
 
-def frames(
-    path: Path, start: int = 0, stop: int | None = None, step: int = 1
-) -> Iterator[tuple[int, Picture]]:
-    """Yield frames start, start + step, ... before stop, one at a time; see `VideoReader.frames`."""
-    with VideoReader(path) as reader:
-        yield from reader.frames(start, stop, step)
-
-
 def black_bars(path: Path) -> tuple[int, int, int, int]:
     """Count the black columns at the left, rows at the top, columns at the right and rows at the bottom.
 

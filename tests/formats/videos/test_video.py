@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.videos import video
-from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames
+from pipelines.formats.videos.video import VideoReader, black_bars, created_ns
 from pipelines.geometry.arrays import Picture
 from pipelines.session.recognition import recognise
 from pipelines.session.records import UNTIMED
@@ -136,7 +136,8 @@ def test_pictures_are_opencvs(tmp_path: Path, turned_deg: int) -> None:
     assert (index.width, index.height) == (SIZE if turned_deg % 180 == 0 else SIZE[::-1])
     # OpenCV gives milliseconds as a float64 of seconds.
     np.testing.assert_allclose(index.pts_ns / 1e6, milliseconds, rtol=0, atol=1e-6)
-    mine = [picture for _, picture in frames(path)]
+    with VideoReader(path) as reader:
+        mine = [picture for _, picture in reader.frames()]
     assert len(mine) == len(pictures)
     assert mine[0].shape == (index.height, index.width, 3)
     assert mine[0].flags.c_contiguous
@@ -151,7 +152,8 @@ def test_a_damaged_frame_is_missing_and_the_others_keep_their_numbers(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = write_video(tmp_path / "v.mp4", uneven_ticks(30), key_every=1, b_frames=0)
-    whole = dict(frames(path))
+    with VideoReader(path) as reader:
+        whole = dict(reader.frames())
     content = bytearray(path.read_bytes())
     for number in (7, 20):
         position, size = packets(path)[number]
