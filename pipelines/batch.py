@@ -85,11 +85,6 @@ class Batch:
     table: Path
     page: Path
 
-    @property
-    def failed(self) -> int:
-        """The number of flights that failed."""
-        return sum(row.error is not None for row in self.rows)
-
 
 def batch(
     flights: Sequence[Path],

@@ -151,8 +151,6 @@ def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:
 
 # --- levels --------------------------------------------------------------------------------------------
 
-# A step of more than so many usual ones lies between two stretches of a flight.
-_GAP = 3.0
 # Pictures of every third time are enough to estimate image noise and white errors.
 _EVERY = 3
 _BODY_ACCELERATION, _BODY_COUNT = 1.5, 3.0  # m/s^2, weight of this prior; the simulated walk's is 1.1
