@@ -115,9 +115,12 @@ def batch(
     _refuse_foreign(folder, overwrite)
     workers = workers or os.cpu_count() or 1
     for_each = 1 if scheduler else max(1, workers // max(len(flights), 1))
+    sessions = [flight.with_suffix(".session") for flight in flights]
+    if output is not None:
+        sessions = [output / f"{name}.session" for name in names_of(flights)]
     jobs = [
         Job(_absolute(flight), _absolute(session), settings, force, for_each)
-        for flight, session in zip(flights, _sessions(flights, output), strict=True)
+        for flight, session in zip(flights, sessions, strict=True)
     ]
     outcomes = dict(_outcomes(jobs, workers, scheduler, progress))
     rows = tuple(_row(folder, job, outcomes[k]) for k, job in enumerate(jobs))
@@ -252,12 +255,6 @@ def _absolute(path: Path) -> Path:
     if url_of(path):
         return path
     return Path(os.path.abspath(path))  # noqa: PTH100  # links stay: media are named relative to the session
-
-
-def _sessions(flights: Sequence[Path], output: Path | None) -> list[Path]:
-    if output is None:
-        return [flight.with_suffix(".session") for flight in flights]
-    return [output / f"{name}.session" for name in names_of(flights)]
 
 
 def _refuse_foreign(folder: Path, overwrite: bool) -> None:

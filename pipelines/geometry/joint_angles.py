@@ -106,7 +106,10 @@ def joint_angles(
     for start in range(0, count, _BLOCK):
         part = slice(start, start + _BLOCK)
         points = np.ascontiguousarray(flat[part].transpose(1, 2, 0))
-        spreads = None if spread is None else np.ascontiguousarray(_known(spread[part]).transpose(1, 2, 0))
+        spreads = None
+        if spread is not None:  # NaN in place of those that say nothing, which may be infinite
+            known = np.where(np.abs(spread[part]) < _UNKNOWN_M2, spread[part], np.nan)
+            spreads = np.ascontiguousarray(known.transpose(1, 2, 0))
         for group in groups:
             of = [joints.index(name) for name in group.joints]
             to = [column[name] for name in group.angles]
@@ -126,11 +129,6 @@ def _worst(status: NDArray[np.int8]) -> NDArray[np.int8]:
     lost = (status != _OK) & (status != _FILLED)
     first = np.where(lost.any(axis=1), lost.argmax(axis=1), (status == _FILLED).argmax(axis=1))
     return np.take_along_axis(status, first[:, None], axis=1)
-
-
-def _known(covariance: Float) -> Float:
-    """Return covariances m^2 with NaN in place of those that say nothing, which may be infinite."""
-    return np.where(np.abs(covariance) < _UNKNOWN_M2, covariance, np.nan)
 
 
 @dataclass(frozen=True)

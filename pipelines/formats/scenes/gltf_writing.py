@@ -58,7 +58,9 @@ class GlbExport:
         t_ns = motion.t_ns[rows]
         asset = GltfAsset((t_ns - t_ns[0]) / 1e9)
         spheres = {side: asset.mesh(*_octahedron(_JOINT_M), side) for side in _MATERIALS}
-        bars = {side: asset.mesh(*_bar(_BONE_M), side) for side in _MATERIALS}
+        corners, triangles = _octahedron(1.0)
+        corners = corners * [_BONE_M, 0.5, _BONE_M] + [0.0, 0.5, 0.0]  # along y from 0 to 1
+        bars = {side: asset.mesh(corners, triangles, side) for side in _MATERIALS}
         for person in range(motion.position.shape[1]):
             label = f"{recording.name_of(person)} " if motion.position.shape[1] > 1 else ""
             _add_person(asset, motion, rows, person, label, spheres, bars)
@@ -134,12 +136,6 @@ def _octahedron(radius: float) -> tuple[Float, Int64]:
     corners = radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     triangles = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
     return corners.astype(np.float64), np.array(triangles)
-
-
-def _bar(half_m: float) -> tuple[Float, Int64]:
-    """Return corners [6, 3] and triangles [8, 3] of a bar along y from 0 to 1, pointed at both ends."""
-    corners, triangles = _octahedron(1.0)
-    return corners * [half_m, 0.5, half_m] + [0.0, 0.5, 0.0], triangles
 
 
 @dataclass

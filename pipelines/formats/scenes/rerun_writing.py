@@ -65,7 +65,10 @@ class RerunExport:
                 _log_sigmas(rr, stream, motion, named)
             _log_angles(rr, stream, recording)
             times = [track.t_ns for track in tracks.values()] + ([motion.t_ns] if motion is not None else [])
-            _log_doubts(rr, stream, recording, min(int(t_ns[0]) for t_ns in times if len(t_ns)))
+            if texts := recording.doubts():
+                start_ns = min(int(t_ns[0]) for t_ns in times if len(t_ns))
+                logged = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
+                stream.send_columns("doubts", [_times(rr, np.full(len(texts), start_ns, np.int64))], logged)
             recording.progress.advance()
             for camera, track in tracks.items():
                 _log_track(rr, stream, camera, track)
@@ -145,13 +148,6 @@ def _log_angles(rr: Any, stream: Any, recording: Recording) -> None:
         for entity, column in ((name, "value_deg"), (f"{name}/sigma", "sigma_deg")):
             values = rows[column].to_numpy()
             _log_series(rr, stream, f"angles/{person}/{entity}", rows["t_ns"].to_numpy(), values)
-
-
-def _log_doubts(rr: Any, stream: Any, recording: Recording, start_ns: int) -> None:
-    if texts := recording.doubts():
-        at = np.full(len(texts), start_ns, dtype=np.int64)
-        logged = rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
-        stream.send_columns("doubts", [_times(rr, at)], logged)
 
 
 def _log_series(rr: Any, stream: Any, entity: str, t_ns: Int64, values: Float) -> None:
