@@ -344,10 +344,11 @@ _TORSO = 0.295
 STATURE_M = 1.73
 """Of a grown-up; 95 % are within 17 % of it (NCD-RisC 2016, men and women together)."""
 
+SIZE_SIGMA = 0.09
+"""Standard deviation of the logarithm of grown-ups' statures."""
+
 # Two in three grown-ups have a stature within this logarithm of the usual one, and are not odd.
 _USUAL_SIZE = 0.08
-# Statures of grown-ups have this standard deviation of their logarithm.
-_SIZE_SIGMA = 0.09
 # Children are small; nobody is so tall. Keypoints make people 10 % shorter to 5 % taller than they are.
 _TALL_SIGMA = 0.05
 # Two moments farther apart than this do not tell the direction in which somebody walks.
@@ -401,7 +402,7 @@ def stature_m(joints: Float) -> float:
 def size_sigmas(joints: Float) -> float:
     """Return how far a person's stature is from a grown-up's, in standard deviations; 0 if unknown."""
     stature = stature_m(joints)
-    return float(np.log(stature / STATURE_M)) / _SIZE_SIGMA if np.isfinite(stature) else 0.0
+    return float(np.log(stature / STATURE_M)) / SIZE_SIGMA if np.isfinite(stature) else 0.0
 
 
 @np.errstate(invalid="ignore", divide="ignore")
@@ -440,17 +441,20 @@ class Body:
         """Return the stature that each limb is usual for."""
         return np.array([median(length) / share for length, share in self.lengths])
 
-    def proportions(self, stature: float) -> dict[str, Oddity]:
-        """Measure the size, and the limbs' lengths over those that are usual for a stature in m."""
+    def proportions(self, stature: float, loose: float) -> dict[str, Oddity]:
+        """Measure the size, and the limbs' lengths over those that are usual for a stature in m.
+
+        Errors of poses change all lengths by a share `loose`.
+        """
         names = [f"{start}_to_{end}" for start, end, _ in _LIMBS] + ["torso"]
         off = np.abs(np.log(self.statures / stature))  # infinite for a limb without length
         worst = int(np.nanargmax(off))
         length, share = self.lengths[worst]
         measured = {f"{names[worst]}_m": median(length), "usual_m": share * stature}
         beyond = max(0.0, abs(np.log(stature / STATURE_M)) - _USUAL_SIZE)
-        sigma = _TALL_SIGMA if stature > STATURE_M else _SIZE_SIGMA
+        sigma = _TALL_SIGMA if stature > STATURE_M else SIZE_SIGMA
         return {
-            "size": Oddity(beyond / sigma, {"stature_m": stature}),
+            "size": Oddity(beyond / float(np.hypot(sigma, loose)), {"stature_m": stature}),
             "shape": Oddity(min(float(np.nanmedian(off)), 5.0) / 0.10, measured),
         }
 

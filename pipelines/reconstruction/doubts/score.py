@@ -23,6 +23,7 @@ from pipelines.reconstruction.doubts.scene import (
     FEW,
     JOINTS,
     PLACED_M,
+    SIZE_SIGMA,
     Body,
     Oddity,
     Sampled,
@@ -333,16 +334,19 @@ def _step(
     cost = float((np.where(used, huber, 0.0) / seen).sum()) + strain
 
     probed_place, probed_ray = np.zeros((len(numbers), *place.shape)), np.zeros((len(numbers), *missed.shape))
-    of_size = np.zeros(unknowns)
     for k, probe in enumerate(_PROBE * np.eye(len(numbers))):
         probed = _with_errors(make(numbers + probe), errors)
         probed_ray[k] = np.where(used[..., None], _directions(probed), 0.0)
         probed_place[k] = np.nan_to_num(probed.position)
-        of_size[errors.size + k] = (size_sigmas(solve(probed).joints) - sized) / _PROBE
     # Each camera has its own errors; the numbers are shared by all; the joints are eliminated.
     rows, both, solution = _linear(
         joints, place, solved.direction, probed_place, probed_ray, np.sqrt(weight), placed, pull
     )
+    # The person grows by what moves the joints away from their middle at each moment.
+    known = np.isfinite(solved.joints).all(axis=2, keepdims=True)
+    middle = joints.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
+    about = np.where(known, joints - middle, 0.0).ravel()
+    of_size = -(about @ solution[:, :-1]) / (max(float(about @ about), 1e-9) * SIZE_SIGMA)
     coupled = both.T @ solution
     normal, right = -coupled[:-1, :-1], -coupled[:-1, -1]
     for camera in range(len(errors)):
@@ -487,11 +491,18 @@ def score(
     stature = median(statures)
     if np.isfinite(statures).sum() < 5 or not stature > 0:
         return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
-    odd = _rays(solved, good, misfit) | body.proportions(stature) | body.posture()
+    odd = _rays(solved, good, misfit) | body.proportions(stature, _loose_scale(scene)) | body.posture()
     odd |= _place(flight, scene, body, solved, stature)
     odd = {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
     total += sum(surprise(each) for each in odd.values())
     return Score(total, misfit, scatter, odd | {"behind": behind, "unposed": unposed(scene)}, stature)
+
+
+def _loose_scale(scene: SceneOfMoments) -> float:
+    """Return by what share errors of positions change the scale of what cameras see between them."""
+    pairs = combinations(scene.position, 2)
+    apart_m = np.max([np.linalg.norm(one - other, axis=-1) for one, other in pairs], axis=0)
+    return float(np.sqrt(2) * scene.sigma[:, 0].mean() / max(median(apart_m), 1e-9))
 
 
 def surprise(odd: Oddity) -> float:
@@ -651,7 +662,7 @@ def _place(
             odd["beside"] = Oddity(6.0, {"on_map_share": share})
         else:
             height_m = median((foot - under)[on_map]) - _ANKLE_ABOVE_GROUND_M
-            above = max(0.0, abs(height_m) - 0.25 - 2 * stated_m) / 0.25
+            above = max(0.0, abs(height_m) - 0.25 - 2 * stated_m) / float(np.hypot(0.25, stated_m))
             odd["ground"] = Oddity(above, {"feet_above_ground_m": height_m})
     else:
         lowest = np.fmin.reduce(body.joints[..., 2], axis=1)
@@ -664,7 +675,8 @@ def _place(
         constant = np.array([median(apart[:, axis]) for axis in range(3)])
         apart_m = float(np.linalg.norm(constant))
         path_m = median(np.linalg.norm(apart - constant, axis=-1))
-        odd["actor"] = Oddity(max(0.0, apart_m - 0.25 - 2 * stated_m) / 0.4, {"from_actor_m": apart_m})
+        away = max(0.0, apart_m - 0.25 - 2 * stated_m) / float(np.hypot(0.4, stated_m))
+        odd["actor"] = Oddity(away, {"from_actor_m": apart_m})
         odd["actor_path"] = Oddity(max(0.0, path_m - 0.45 - 2 * white_m) / 0.3, {"path_apart_m": path_m})
     return odd
 
