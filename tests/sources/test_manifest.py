@@ -28,7 +28,12 @@ FIXES = [
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> SyntheticFlight:
-    return write_flight(tmp_path_factory.mktemp("flight"), cameras=2, seconds=0.2, clean=True)
+    flight = write_flight(tmp_path_factory.mktemp("flight"), cameras=2, seconds=0.2, clean=True)
+    folder, truth = flight.manifest.parent, drone_of(flight, 0)
+    write_srt(folder / "a.SRT", truth)
+    write_dataflash(folder / "a.bin", truth)
+    write_mcap(folder / "a.mcap", FIXES)
+    return flight
 
 
 def checked(flight: SyntheticFlight, change: dict[str, Any]) -> None:
@@ -64,10 +69,6 @@ def checked(flight: SyntheticFlight, change: dict[str, Any]) -> None:
 def test_an_option_belongs_to_the_format_of_its_file(
     flight: SyntheticFlight, file: str, options: dict[str, Any], code: str, key: str
 ) -> None:
-    folder, truth = flight.manifest.parent, drone_of(flight, 0)
-    write_srt(folder / "a.SRT", truth)
-    write_dataflash(folder / "a.bin", truth)
-    write_mcap(folder / "a.mcap", FIXES)
     with pytest.raises(DataError) as caught:
         checked(flight, {"pose": {"file": file, **options}, "mount": None})
     assert caught.value.code == code
@@ -87,10 +88,6 @@ def test_an_option_belongs_to_the_format_of_its_file(
 def test_an_option_is_taken_by_the_format_of_its_file(
     flight: SyntheticFlight, options: dict[str, Any]
 ) -> None:
-    folder, truth = flight.manifest.parent, drone_of(flight, 0)
-    write_srt(folder / "a.SRT", truth)
-    write_dataflash(folder / "a.bin", truth)
-    write_mcap(folder / "a.mcap", FIXES)
     checked(flight, {"pose": options})
 
 

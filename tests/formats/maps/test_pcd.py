@@ -72,16 +72,7 @@ def write(path: Path, encoding: str, points: Float = clouds.POINTS) -> Path:
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 def test_voxels_hold_the_points(tmp_path: Path, encoding: str) -> None:
     path = write(tmp_path / "a.pcd", encoding)
-    assert READER.recognises(path)
-    occupancy = READER.read_map(path)
-    assert occupancy.probability.shape == clouds.SHAPE
-    assert occupancy.origin == pytest.approx(clouds.ORIGIN)
-    assert occupancy.resolution_m == 0.2
-    assert list(occupancy.dropped.values()) == [2]
-    assert np.argwhere(occupancy.probability == 1).tolist() == clouds.OCCUPIED
-    assert np.isnan(occupancy.probability).sum() == occupancy.probability.size - 2
-    said = READER.describe(path)
-    assert (said["occupied_voxels"], said["free_voxels"]) == (2, 0)
+    clouds.assert_holds_the_points(READER, path)
     assert READER.read_map(path, resolution_m=0.1).probability.shape == (3, 3, 11)
 
 
@@ -95,15 +86,8 @@ def test_lzf_reads_what_liblzf_wrote() -> None:
 
 @pytest.mark.parametrize("name", ["pcl_bunny_ascii", "pcl_colored_cloud", "ndt_omp_251370668"])
 def test_real_clouds_are_read_as_by_other_readers(name: str) -> None:
-    told = facts(f"maps/{name}.pcd")
     path = real_data(f"maps/{name}.pcd")
     assert READER.recognises(path)
-    points = point_files.read_pcd(path)
-    finite = points[np.isfinite(points).all(axis=1)]
-    assert (len(points), len(finite)) == (told["points"], told["finite_points"])
-    # Facts are rounded to 0.1 mm.
-    for found, its in ((finite.min(0), told["bbox"]["min"]), (finite.max(0), told["bbox"]["max"])):
-        assert found == pytest.approx(its, abs=1.01e-4)
-    assert finite.mean(axis=0) == pytest.approx(told["centroid"], abs=1.01e-4)
+    finite = clouds.finite_as_told(point_files.read_pcd(path), facts(f"maps/{name}.pcd"))
     occupied = np.count_nonzero(READER.read_map(path).probability == 1)
     assert occupied == len(np.unique(np.floor(finite / 0.2), axis=0))

@@ -42,24 +42,9 @@ def write(path: Path, encoding: str) -> Path:
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_voxels_hold_the_vertices(tmp_path: Path, encoding: str) -> None:
-    path = write(tmp_path / "a.ply", encoding)
-    assert READER.recognises(path)
-    occupancy = READER.read_map(path)
-    assert occupancy.probability.shape == clouds.SHAPE
-    assert occupancy.origin == pytest.approx(clouds.ORIGIN)
-    assert list(occupancy.dropped.values()) == [2]
-    assert np.argwhere(occupancy.probability == 1).tolist() == clouds.OCCUPIED
-    said = READER.describe(path)
-    assert (said["occupied_voxels"], said["free_voxels"]) == (2, 0)
+    clouds.assert_holds_the_points(READER, write(tmp_path / "a.ply", encoding))
 
 
 def test_the_real_cloud_is_read_as_by_other_readers() -> None:
-    told = facts("maps/small_gicp_target.ply")
     path = real_data("maps/small_gicp_target.ply")
-    points = point_files.read_ply(path)
-    finite = points[np.isfinite(points).all(axis=1)]
-    assert (len(points), len(finite)) == (told["points"], told["finite_points"])
-    # Facts are rounded to 0.1 mm.
-    for found, its in ((finite.min(0), told["bbox"]["min"]), (finite.max(0), told["bbox"]["max"])):
-        assert found == pytest.approx(its, abs=1.01e-4)
-    assert finite.mean(axis=0) == pytest.approx(told["centroid"], abs=1.01e-4)
+    clouds.finite_as_told(point_files.read_ply(path), facts("maps/small_gicp_target.ply"))
