@@ -35,7 +35,7 @@ from pipelines.keypoints.corrections import (
     swaps_across_views,
     undo_swaps_of_tracks,
 )
-from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras
+from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras, turned_aside
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
 from pipelines.reconstruction.bodies import (
     bodies_of_one_camera,
@@ -418,6 +418,7 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
         cameras,
         chosen=chosen_detections(cameras, attempt.found, attempt.association),
         followed=flight.followed,
+        aside=turned_aside,
         pose_noise=flight.settings.pose_noise,
     )
     return [*doubts_of_clocks(flight.description, attempt.metrics.get("clocks_moved", {})), *doubts]

@@ -1,6 +1,7 @@
 """Clocks by the backgrounds of pictures: cameras that turn and move in front of known points."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.noise import Drift, pose_errors
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
-from pipelines.reconstruction.background import clocks_of_backgrounds
+from pipelines.reconstruction.background import clocks_of_backgrounds, turned_aside
 from pipelines.reconstruction.background_tracks import Followed, Tracks
 from pipelines.reconstruction.doubts.alternatives import RATES
 from pipelines.reconstruction.doubts.turning import Lateness, common_offset, lateness, turns_of
@@ -185,3 +186,19 @@ def test_a_clock_that_is_stated_well_hardly_moves() -> None:
     share = 1 / (1 + (own_s / 0.002) ** 2)
     assert near == pytest.approx(share * wide, rel=0.01)
     assert stated_s < 0.002
+
+
+def test_a_camera_that_looks_beside_its_log_is_found() -> None:
+    """A log whose attitudes are turned by 12 deg across the path; the right one tells nothing."""
+    camera = Turning(0.1, T_NS)
+    for degrees in (0.0, 12.0):
+        turn = matrix_from_quaternion(quaternion_from_rotation_vector(np.radians([0.0, degrees, 0.0])))
+
+        def turned(t_ns: Int64, between: Interpolation, turn: Float = turn) -> tuple[Float, Float]:
+            position, rotation = camera.poses_at(t_ns, between)
+            return position, rotation @ turn
+
+        logged: Any = SimpleNamespace(**vars(camera), poses_at=turned)
+        aside = turned_aside(logged, camera.followed(), BETWEEN)
+        assert (aside is not None) == (degrees > 0)
+        assert aside is None or np.degrees(aside[0]) == pytest.approx(degrees, abs=1.0)

@@ -7,7 +7,7 @@ none is, the doubt is stated without a cause.
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.doubts import alternatives, remedies
 from pipelines.reconstruction.doubts.alternatives import (
     LEAST_SIGMAS,
@@ -48,10 +49,16 @@ from pipelines.reconstruction.doubts.score import (
     surprise,
     unposed,
 )
-from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
+from pipelines.reconstruction.doubts.turning import (
+    LEAST_GAIN,
+    Lateness,
+    all_turns,
+    is_sure_clock,
+    lateness,
+)
 from pipelines.reconstruction.loading import load_truth
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.description import Description, Doubt
+from pipelines.session.description import Description, Doubt, Interpolation
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 
@@ -125,6 +132,7 @@ def doubts_of(
     *,
     chosen: Sequence[Int64],
     followed: Mapping[str, object],
+    aside: Callable[[Camera, Followed, Interpolation], tuple[float, float] | None],
     pose_noise: str | None = None,
 ) -> list[Doubt]:
     """Diagnose a session.
@@ -138,6 +146,7 @@ def doubts_of(
         cameras: with their detections.
         chosen: which detection [F] of each camera's pictures the actor is, -1 for none.
         followed: backgrounds of cameras by name; what is none is ignored.
+        aside: finds by how much a camera looks beside its log (`background.turned_aside`).
         pose_noise: the value of `--pose-noise`, if any.
 
     Raises:
@@ -160,7 +169,13 @@ def doubts_of(
     if flight is not None and truth is not None:
         size_m = stature_m(truth.position[:, 0])
         flight = flight._replace(truth_m=size_m if np.isfinite(size_m) else None)
-    found = diagnose(flight, late)
+    looks = {}
+    for index, camera in enumerate(flight.cameras if flight is not None else ()):
+        seen = followed.get(camera.name)
+        # Attitudes by pictures are not compared with themselves.
+        if isinstance(seen, Followed) and camera.entry.picture_map is None:
+            looks[index] = partial(aside, camera.camera, seen, description.pose_interpolation)
+    found = diagnose(flight, late, looks)
     # A gimbal that nothing uses, where it can be, explains more than any other change would.
     unused = [doubt for doubt in description.doubts if doubt.code == "unused" and found]
     is_mended = any(doubt.remedy for doubt in unused)
@@ -205,7 +220,11 @@ def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | No
     return min(chosen, prominent, key=lambda flight: score(flight, scene_of(flight)).total)
 
 
-def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doubt]:
+def diagnose(
+    flight: Sampled | None,
+    late: Sequence[Lateness] = (),
+    looks: Mapping[int, Callable[[], tuple[float, float] | None]] | None = None,
+) -> list[Doubt]:
     """Find what is odd about a flight, and why, that first that explains the most.
 
     A flight of one camera, or whose cameras share no time, is not doubted here. A world on its side is named
@@ -214,6 +233,7 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     Args:
         flight: the flight.
         late: what the backgrounds tell of the cameras' times.
+        looks: what finds the angle, and its standard deviation, rad, by which a camera looks beside its log.
     """
     if flight is None or len(flight.cameras) < 2:
         return []
@@ -250,6 +270,8 @@ def diagnose(flight: Sampled | None, late: Sequence[Lateness] = ()) -> list[Doub
     if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
         level = alternatives.level(trial, solve(trial.described).joints) if fits else ()
         causes = [Tried(each) for each in level] or causes or _below_zero(objective)
+    if (odd or objective.described.strain >= STRAINED) and not _is_explained(causes):
+        causes = _of_looks(trial, looks or {}) or causes
     doubts = [
         _doubt(trial, each, found, [cause.alternative.code for cause in causes if cause.score])
         for each in causes
@@ -557,6 +579,27 @@ def _of_turns(objective: Objective, tried: Sequence[Lateness]) -> list[Tried]:
         what = f"the pictures of {whose} were taken {remedies.earlier_or_later(late.late_s)}, {by}"
         evidence["clock_sigma_s"] = round(late.sigma_s, 3)
     return [Tried(Alternative(code, trial.named(late.cameras), what, remedy, 0.0, evidence=evidence))]
+
+
+def _is_explained(causes: Sequence[Tried]) -> bool:
+    """Test for a cause beside which attitudes need no other: numbers that are fitted to people hide them."""
+    if not causes:
+        return False
+    first = causes[0]
+    fits = first.score is not None and first.score.misfit < MISSED
+    return first.numbers == 0 or (first.alternative.code == "mount" and fits)
+
+
+def _of_looks(trial: Trial, looks: Mapping[int, Callable[[], tuple[float, float] | None]]) -> list[Tried]:
+    """State which cameras look beside their logs, as their backgrounds show, and let their films say how."""
+    found = {index: seen for index, find in looks.items() if (seen := find()) is not None}
+    degrees = {trial.names[index]: np.degrees(seen).round(1).tolist() for index, seen in found.items()}
+    said = ", ".join(f"{name} by {angle:.0f} deg" for name, (angle, _) in degrees.items())
+    evidence = {f"aside_deg_{name}": angle for name, (angle, _) in degrees.items()}
+    evidence |= {f"aside_sigma_deg_{name}": sigma for name, (_, sigma) in degrees.items()}
+    what = f"the background shows that the camera looks elsewhere than logged: {said}"
+    remedy = remedies.by_pictures(trial.cameras, list(found))
+    return [Tried(Alternative("mount", tuple(degrees), what, remedy, 0.0, evidence=evidence))] * bool(found)
 
 
 def _of_logs(objective: Objective) -> list[Tried]:

@@ -94,6 +94,19 @@ def mount(
     return _lines(cameras, group, said)
 
 
+def by_pictures(cameras: Sequence[Filmed], group: Sequence[int]) -> str:
+    """Let the films of cameras say how they turned, in place of logs, mounts and gimbals."""
+
+    def said(camera: Filmed) -> str:
+        poses = camera.entry.poses
+        if not (poses.mount or poses.in_gimbal or poses.gimbal):
+            return "pose.attitude: pictures"
+        others = "".join(f"; cameras.{camera.name}.{key}: null" for key in ("pose.of", "mount", "gimbal"))
+        return f"pose.attitude: pictures{others}"
+
+    return _lines(cameras, group, said)
+
+
 def down_deg(camera: Filmed) -> float:
     """Return by how much a camera's mount tilts it down; 0 without a mount, or where that is no tilt."""
     mount = camera.mount
