@@ -247,7 +247,10 @@ DOUBT_CODES = {
         "All positions are larger or smaller than they should be.",
         "world.scale, pose.world_from_source",
     ),
-    "mount": ("The camera is rolled, looks another way, or tilts up instead of down.", "mount, pose.attitude"),
+    "mount": (
+        "The camera is rolled, looks another way, or tilts up instead of down.",
+        "mount, pose.attitude",
+    ),
     "gimbal": (
         "The angles of gimbals are in other axes, or relative to something else.",
         "gimbal.axes, gimbal.relative_to",
