@@ -67,7 +67,7 @@ def study_command(
         for table in tables(metrics):
             say()
             say(table.title)
-            print_table(table.header, table.rows)
+            print_table(table.header, table.rows, names=table.names)
         if metrics.get("verdict"):
             say()
             say(metrics["verdict"])

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # A longer line hides what was printed before it.
 MAX_LINE_CHARACTERS = 2000
+# Terminals are at least so wide; a longer line of a table would be broken anywhere.
+TERMINAL_COLUMNS = 100
 
 
 def one_line(text: str) -> str:
@@ -171,20 +173,30 @@ def print_json(result: Mapping[str, object]) -> None:
     click.echo("".join(c if _is_shown(c) or c == "\n" else json.dumps(c)[1:-1] for c in text))
 
 
-def print_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Print a plain table: text aligned left, numbers right, `-` for a missing value."""
+def print_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, names: int = 1) -> None:
+    """Print a plain table: text aligned left, numbers right, `-` for a missing value.
+
+    A table wider than a terminal is printed in parts below each other, each with the first `names` columns.
+    """
     texts = [[_cell(value) for value in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(header, *texts, strict=True)]
     numeric = [
         all(isinstance(row[k], int | float | None) for row in rows) if rows else False
         for k in range(len(header))
     ]
-    for line in [list(header), *texts]:
-        cells = [
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(line, widths, numeric, strict=True)
-        ]
-        say("  ".join(cells).rstrip())
+    parts, used = [list(range(names))], sum(widths[:names]) + 2 * names
+    for k, width in enumerate(widths[names:], start=names):
+        if used + width > TERMINAL_COLUMNS and len(parts[-1]) > names:
+            parts.append(list(range(names)))
+            used = sum(widths[:names]) + 2 * names
+        parts[-1].append(k)
+        used += width + 2
+    for number, part in enumerate(parts):
+        if number:
+            say()
+        for line in [list(header), *texts]:
+            cells = [line[k].rjust(widths[k]) if numeric[k] else line[k].ljust(widths[k]) for k in part]
+            say("  ".join(cells).rstrip())
 
 
 def _cell(value: object) -> str:

@@ -17,13 +17,13 @@ import numpy as np
 
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
-from pipelines.geometry.arrays import Float, Int64, Picture
+from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.noise import NoiseModel
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.comparison import common_frames, figures_of, filmed_verdict, judge
 from pipelines.planning.formation import TILT, slot_of
-from pipelines.planning.replay import MeasuredJoints, joined, poses_from
+from pipelines.planning.replay import MeasuredJoints, joined, known_from, poses_from
 from pipelines.planning.scene import LoggedFlight, load_flight
 from pipelines.reconstruction.refining import refined_points
 from pipelines.session.description import Description, read_description
@@ -47,7 +47,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=10)
+FILM = Stage("film", revision=11)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -210,6 +210,7 @@ class _Arm:
     tilt_rad: Float | None  # [N, T] above whom each camera films; None for one person
     seen_by: CameraFormation
     logged: list[Float]  # positions [T, 3] m of each logged person
+    known: Bool  # [N, T] False where a log has a gap, or a battery is empty: nothing is detected there
     noise: tuple[NoiseModel, ...]
 
     @property
@@ -284,6 +285,7 @@ def _arm(
         tilt.take(rows, axis=1) if len(people) > 1 else None,
         seen_by,
         hips,
+        known_from(table, len(cameras))[:, rows],
         flight.cameras[0].noise,
     )
 
@@ -307,6 +309,8 @@ def _film_camera(
     alone = len(arm.people) == 1
     follower = FollowedPeople(detector.load(threads=1), arm.people[0].person.joints, only_one=alone)
     found: list[tuple[Float, Float]] = []
+    joints = len(arm.people[0].person.joints)
+    nobody = np.empty((0, joints, 2)), np.empty((0, joints))
 
     def pictures() -> Iterator[Picture]:
         for k in range(len(arm.t_ns)):
@@ -317,7 +321,8 @@ def _film_camera(
                 project_actor(hips[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD)
                 for hips in arm.logged
             ]
-            found.append(_whose(arm, pose, k, *follower.step(picture, hints=hints)))
+            seen = follower.step(picture, hints=hints) if arm.known[camera, k] else nobody
+            found.append(_whose(arm, pose, k, *seen))
             yield picture
             progress.advance()
 

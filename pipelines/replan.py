@@ -61,7 +61,7 @@ from pipelines.simulation.detector_errors import (
 )
 from pipelines.simulation.scenario import DetectorErrors
 
-REPLAN_STAGE = Stage("replan", revision=12)
+REPLAN_STAGE = Stage("replan", revision=13)
 
 # The detector's errors were measured by the size of a person of this height in the picture.
 PERSON_HEIGHT_M = 1.75
@@ -300,7 +300,6 @@ def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
     measured = measure_arm(scene, flown, partial(detect_by_model, joints=joints, errors=errors))
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
-    np.save(folder / "known.npy", flown.known)
     np.save(folder / "aim.npy", flown.aim)
     facts: dict[str, object] = {"safety": flown.safety, "joint_frames": 0}
     if measured is not None:
@@ -315,9 +314,7 @@ def read_result(folder: Path) -> ArmResult:
     table = read_table(folder / "trajectories.parquet", REPLAN)
     errors = folder / "error_m.npy"
     return ArmResult(
-        flight=flight_from(
-            table, np.load(folder / "aim.npy"), np.load(folder / "known.npy"), facts["safety"]
-        ),
+        flight=flight_from(table, np.load(folder / "aim.npy"), facts["safety"]),
         measured=MeasuredJoints(np.load(errors), facts["joint_frames"]) if errors.exists() else None,
     )
 

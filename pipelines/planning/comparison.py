@@ -194,7 +194,9 @@ def _scores(
         scene.config,
         people=scene.people,
         seen=seen,
-        pushed=0.0 if name in LOGGED else blown(np.zeros_like(flown.position), scene.t_s, scene.config),
+        pushed=0.0
+        if name in LOGGED
+        else blown(np.zeros_like(flown.position), scene.t_s, scene.config, scene.settings.seed),
     )
     own = result.measured
     figures = _NOTHING if own is None or shared is None else figures_of(own, None, shared)

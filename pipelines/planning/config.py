@@ -196,6 +196,12 @@ class PlannerConfig:
         return self.separation_m + self.tuning.soft_separation_margin_m
 
     @property
+    def soft_actor_distance_m(self) -> float:
+        """Distance below which plans avoid people."""
+        margin_m = self.tuning.soft_separation_margin_m
+        return self.actor_distance_m + margin_m if self.actor_distance_m else 0.0
+
+    @property
     def slot_rates(self) -> tuple[float, float, float]:
         """Rates of change of a slot's yaw (rad/s), tilt (rad/s) and range (m/s)."""
         tilt_rate = math.radians(self.tuning.tilt_rate_deg_per_s)

@@ -4,7 +4,7 @@ The kernels have no threads and no fastmath: the same numbers give the same byte
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -25,8 +25,6 @@ ROUNDING = 1e-4
 BRICK = 4
 # The leap is stored in seven bits of a byte.
 MAX_LEAP = 127
-# Distances are computed so many voxels at a time, because scipy holds four numbers for each of them.
-SLAB_VOXELS = 1_000_000
 # OctoMap takes a voxel for an obstacle from this probability on.
 OCCUPIED = 0.5
 # No drone flies so far: everything in a map without obstacles has this distance.
@@ -250,7 +248,7 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
     """Compute the distance field of a voxel map: from 0.5 on occupied, NaN unknown.
 
     M = d_free - res/2 outside and -(d_occ - res/2) inside, with the exact Euclidean distances between voxel
-    centres (scipy): the surface lies on the faces between voxels. Without obstacles it is 1 km everywhere.
+    centres: the surface lies on the faces between voxels. Without obstacles it is 1 km everywhere.
     """
     with np.errstate(invalid="ignore"):
         occupied = occupancy.probability >= OCCUPIED
@@ -264,19 +262,14 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
 
 
 def _grid(occupied: NDArray[np.bool_], occupancy: Occupancy) -> Grid:
-    half = occupancy.resolution_m / 2
     if not occupied.any():
         distance = np.full(occupied.shape, NOWHERE_M, dtype=np.float32)
     elif occupied.all():
         distance = np.full(occupied.shape, -NOWHERE_M, dtype=np.float32)
     else:
-        distance = np.empty(occupied.shape, dtype=np.float32)
         box = _box_around(occupied)
-        within = distance[box]  # what it leaves out is free, and filled below
-        for part, inside_m in _distances(occupied[box], occupancy.resolution_m):
-            within[part] = half - inside_m
-        for part, outside_m in _distances(~occupied, occupancy.resolution_m):
-            np.copyto(distance[part], (outside_m - half).astype(np.float32), where=~occupied[part])
+        distance = _depths(~occupied, occupancy.resolution_m)
+        distance[box] -= _depths(np.ascontiguousarray(occupied[box]), occupancy.resolution_m)
     # Interpolation needs two centres along each axis; beyond the border the field is constant anyway.
     for axis in range(3):
         if distance.shape[axis] == 1:
@@ -296,21 +289,64 @@ def _box_around(occupied: NDArray[np.bool_]) -> tuple[slice, ...]:
     return tuple(found)
 
 
-def _distances(inside: NDArray[np.bool_], resolution_m: float) -> Iterator[tuple[slice, Float]]:
-    """Yield the exact distances (m) [., Y, Z] to the nearest voxel outside, a slab [X, Y, Z] at a time."""
-    from scipy.ndimage import distance_transform_edt
+@helper
+def _lower_envelope(squares: Int64, places: Int64, crossing: Float) -> None:
+    """Replace squares [n] at k by the least squares[q] + (k - q)^2 (Felzenszwalb and Huttenlocher 2012).
 
-    nearest_voxel = distance_transform_edt(
-        inside, sampling=resolution_m, return_distances=False, return_indices=True
-    )
-    thick = max(1, SLAB_VOXELS // max(1, inside[0].size))
-    for first in range(0, len(inside), thick):
-        part = slice(first, first + thick)
-        squared = np.zeros(nearest_voxel[0, part].shape)
-        for axis, own in enumerate(np.ogrid[tuple(slice(size) for size in inside.shape)]):
-            steps = nearest_voxel[axis, part] - (own[part] if axis == 0 else own)
-            squared += (steps * resolution_m) ** 2
-        yield part, np.sqrt(squared)
+    `places` [2, n] and `crossing` [n] are work space.
+    """
+    count, (lowest, height) = 0, places
+    for q in range(squares.size):
+        height[q] = squares[q]
+        while count:
+            p = lowest[count - 1]
+            meets = (squares[q] + q * q - squares[p] - p * p) / (2.0 * (q - p))
+            if count > 1 and meets <= crossing[count - 1]:
+                count -= 1
+                continue
+            crossing[count] = meets
+            break
+        lowest[count] = q
+        count += 1
+    now = 0
+    for k in range(squares.size):
+        while now + 1 < count and crossing[now + 1] < k:
+            now += 1
+        squares[k] = height[lowest[now]] + (k - lowest[now]) ** 2
+
+
+@cached
+def _depths(inside: NDArray[np.bool_], resolution_m: float) -> NDArray[np.float32]:
+    """Compute the distances [X, Y, Z] (m) of voxels inside to the face of the nearest one outside, else 0.
+
+    Those between the voxels' centres are exact: they are half a voxel larger.
+    """
+    size = inside.shape
+    far, longest = size[0] + size[1] + size[2], max(size)
+    squares, depth_m = np.empty(size, dtype=np.int32), np.zeros(size, dtype=np.float32)
+    line, places, crossing = np.empty(longest, np.int64), np.empty((2, longest), np.int64), np.empty(longest)
+    for i in range(size[0]):
+        for j in range(size[1]):
+            steps = far
+            for k in range(size[2]):
+                steps = min(steps + 1, far) if inside[i, j, k] else 0
+                squares[i, j, k] = steps
+            steps = far
+            for k in range(size[2] - 1, -1, -1):
+                steps = min(steps + 1, far) if inside[i, j, k] else 0
+                squares[i, j, k] = min(steps, squares[i, j, k]) ** 2
+        for k in range(size[2]):
+            line[: size[1]] = squares[i, :, k]
+            _lower_envelope(line[: size[1]], places, crossing)
+            squares[i, :, k] = line[: size[1]]
+    for j in range(size[1]):
+        for k in range(size[2]):
+            line[: size[0]] = squares[:, j, k]
+            _lower_envelope(line[: size[0]], places, crossing)
+            for i in range(size[0]):
+                if inside[i, j, k]:
+                    depth_m[i, j, k] = resolution_m * (math.sqrt(line[i]) - 0.5)
+    return depth_m
 
 
 def open_space() -> DistanceField:

@@ -22,7 +22,15 @@ from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, Grid, interpolate
 from pipelines.planning.forecast import ActorFilter
-from pipelines.planning.local import POSITION, VELOCITY, DronePlan, flying_of, roll_out, stopping_ticks
+from pipelines.planning.local import (
+    ACTOR_AHEAD_S,
+    POSITION,
+    VELOCITY,
+    DronePlan,
+    flying_of,
+    roll_out,
+    stopping_ticks,
+)
 
 # At 8 m/s a drone flies 0.4 m between two checks; every half voxel is checked as well.
 CHECK_PERIOD_S = 0.05
@@ -38,8 +46,6 @@ CLIMB_MPS = 2.0
 ASIDE_MPS = 1.5
 # A drone takes up another velocity with this share of its acceleration; tracking needs the rest.
 ACCELERATION_SHARE = 0.75
-# Forecasts of a person who may turn are not trusted beyond two seconds.
-ACTOR_AHEAD_S = 2.0
 # Somebody who turns back at 5 m/s comes 4 m nearer before measurements tell it.
 REVERSES_S = 0.8
 # A way out is nearly always within this window, and larger ones cost the cube of their size.

@@ -11,29 +11,29 @@ from pipelines.planning.formation import wrapped
 OUTAGE_S = 2.0
 # Gusts at the height of drones last for seconds.
 GUST_S = 2.0
-# Outages and gusts are the same for every arm.
-OUTAGE_SEED, GUST_SEED = 1, 2
+# Outages and gusts are the same for every arm: they are drawn by the comparison's seed and these numbers.
+OUTAGE_STREAM, GUST_STREAM = 1, 2
 # Gusts blow half as strongly upwards as along level axes.
 GUST_SHARES = (1.0, 1.0, 0.5)
 # Rotors of small drones drag by 0.2 to 0.5 of the air's speed a second (Faessler et al. 2018).
 DRAG_PER_S = 0.3
 
 
-def outages(t_s: Float, imperfections: Imperfections) -> Bool:
+def outages(t_s: Float, imperfections: Imperfections, seed: int) -> Bool:
     """Mark the times [T], ascending, at which drones hear nobody: stretches of 2 s, by chance."""
     blocks = np.asarray((t_s - t_s[0]) // OUTAGE_S, dtype=np.int64)
-    lost = np.random.default_rng(OUTAGE_SEED).random(blocks[-1] + 1) < imperfections.outage_share
+    lost = np.random.default_rng([seed, OUTAGE_STREAM]).random(blocks[-1] + 1) < imperfections.outage_share
     lost[0] = False
     found: Bool = lost[blocks]
     return found
 
 
-def blown(position: Float, t_s: Float, config: PlannerConfig) -> Float:
+def blown(position: Float, t_s: Float, config: PlannerConfig, seed: int) -> Float:
     """Add the way to which Gauss-Markov gusts push drones at [N, T, 3] m off their tracks, as they track."""
     gust_mps = config.imperfections.gust_mps
     if not gust_mps:
         return position
-    rng, tuning = np.random.default_rng(GUST_SEED), config.tuning
+    rng, tuning = np.random.default_rng([seed, GUST_STREAM]), config.tuning
     off, rate, total = (np.zeros((len(position), 3)) for _ in range(3))
     sigma_mps = gust_mps * np.array(GUST_SHARES)
     gust = sigma_mps * rng.standard_normal(off.shape)

@@ -38,6 +38,8 @@ from pipelines.planning.distance_field import DIAGONAL, DistanceField, Grid, int
 POSITION, VELOCITY, ACCELERATION, INTEGRAL = range(4)
 """Rows of a drone's state [4, 3]: m, m/s, m/s^2, and the integral of the position error in m s."""
 
+# Forecasts of a person who may turn are not trusted beyond two seconds.
+ACTOR_AHEAD_S = 2.0
 # Acceleration changes from limit to limit in 0.16 s by default, which has to end before the speed's limit.
 LOOKAHEAD_S = 0.25
 # The deceleration falls with the speed in the end of a stop, which so ends without a jerk.
@@ -240,7 +242,6 @@ class Weights(NamedTuple):
     a_jerk: float
     eps_obs_m: float
     eps_occ_m: float
-    soft_separation_m: float
     sight_start_m: float
     speed_floor_mps: float
     step_s: float  # between waypoints
@@ -260,7 +261,6 @@ def weights_of(config: PlannerConfig, resolution_m: float) -> Weights:
         a_jerk=config.tuning.a_jerk,
         eps_obs_m=config.tuning.eps_obs_m,
         eps_occ_m=config.tuning.eps_occ_m,
-        soft_separation_m=config.soft_separation_m,
         sight_start_m=config.tuning.sight_start_m,
         speed_floor_mps=config.tuning.speed_floor_mps,
         step_s=config.tuning.waypoint_s,
@@ -350,7 +350,10 @@ def _total(
     terms: Float,
     gradient: Float,
 ) -> float:
-    """Compute the cost of a path [N + 3, 3]; fill `terms`, in the order of `TERMS`, and `gradient`."""
+    """Compute the cost of a path [N + 3, 3]; fill `terms`, in the order of `TERMS`, and `gradient`.
+
+    `others` [M, N, 4] are places of others, and the distance below which the path avoids them.
+    """
     n = slots.shape[0]
     gradient[:] = 0.0
     terms[:] = 0.0
@@ -391,8 +394,8 @@ def _total(
         for o in range(others.shape[0]):
             ox, oy, oz = q[0] - others[o, i, 0], q[1] - others[o, i, 1], q[2] - others[o, i, 2]
             apart = max(math.sqrt(ox * ox + oy * oy + oz * oz), 1e-9)
-            if apart < w.soft_separation_m:
-                short = w.soft_separation_m - apart
+            if apart < others[o, i, 3]:
+                short = others[o, i, 3] - apart
                 terms[4] += short * short / (2.0 * n)
                 push = w.l_sep * short / (apart * n)
                 gradient[i, 0] -= push * ox
@@ -524,26 +527,32 @@ class LocalPlanner:
         slots: Float,
         actor: Float,
         others: Sequence[DronePlan],
+        people: Float,
         field: DistanceField,
         previous: DronePlan | None,
     ) -> DronePlan:
         """Plan from the drone's place and velocity [3].
 
         `slots` and `actor` [N, 3] are the wanted places and the forecast at each waypoint's time, `others`
-        the latest plans of other drones, `previous` the initial guess: without one it is the slots.
+        the latest plans of other drones, `people` [P, N + 1, 3] the forecast of everybody from now on,
+        `previous` the initial guess: without one it is the slots.
         """
         config = self._config
         times = t_s + config.tuning.waypoint_s * np.arange(1, config.tuning.waypoints + 1, dtype=np.float64)
-        waypoints = np.empty((len(others), len(times) + 1, 3))
-        for k, other in enumerate(others):
-            waypoints[k] = other.at(np.append(t_s, times))[0]
+        avoided = np.empty((len(others) + 2 * len(people), len(times), 4))
+        for row, plan in zip(avoided, others, strict=False):
+            row[:, :3], row[:, 3] = plan.at(times)[0], config.soft_separation_m
+        walking, standing = np.split(avoided[len(others) :], 2)
+        walking[..., :3], walking[..., 3] = people[:, 1:], config.soft_actor_distance_m
+        standing[..., :3] = people[:, :1]
+        standing[..., 3] = np.where(times - t_s <= ACTOR_AHEAD_S, config.soft_actor_distance_m, 0.0)
         guess = slots if previous is None else previous.at(times)[0]
-        path, cost = self._descended(position, velocity, guess, slots, actor, waypoints, field)
+        path, cost = self._descended(position, velocity, guess, slots, actor, avoided, field)
         if previous is not None and np.linalg.norm(path[-1] - slots[-1]) > ASTRAY_M:
             # Caught behind something: descend once more from the slots, and take the better result.
-            another = self._descended(position, velocity, slots, slots, actor, waypoints, field)
-            if another[1] < cost:
-                path = another[0]
+            other = self._descended(position, velocity, slots, slots, actor, avoided, field)
+            if other[1] < cost:
+                path = other[0]
         return DronePlan(t_s, path[2:].copy(), velocity.copy(), config.tuning.waypoint_s)
 
     def _descended(
@@ -556,13 +565,13 @@ class LocalPlanner:
         others: Float,
         field: DistanceField,
     ) -> tuple[Float, float]:
-        """Descend from a guess [N, 3]: path [N + 3, 3] and cost. `others` is [M, N + 1, 3]."""
+        """Descend from a guess [N, 3]: path [N + 3, 3] and cost. `others` is [M, N, 4]."""
         config = self._config
         return _descend(
             _with_start(position, velocity, guess, config.tuning.waypoint_s),
             np.ascontiguousarray(slots),
             np.ascontiguousarray(actor),
-            np.ascontiguousarray(others[:, 1:]),
+            others,
             field.grid,
             self._weights_for(field),
             self._factor,

@@ -181,6 +181,7 @@ class Pilot:
         """Predict the flight along a path (`arms.RollOut`): the drones plan locally, one after the other."""
         wanted, aimed = self._wanted_ahead(path, t_s)
         made: list[DronePlan] = []
+        people = self._people_ahead(t_s)
         for i, previous in enumerate(self._plans):
             plan = self._local_planner.plan(
                 t_s,
@@ -189,14 +190,21 @@ class Pilot:
                 slots=wanted[:, i],
                 actor=aimed[i],
                 others=made,
+                people=people,
                 field=field,
                 previous=previous,
             )
             made.append(plan)
         return np.stack([plan.path[1:] for plan in made]), aimed[0]
 
+    def _people_ahead(self, t_s: float) -> Float:
+        """Forecast everybody, [P, N + 1, 3], now and at the waypoints."""
+        tuning = self._config.tuning
+        return self._filter.each(t_s + tuning.waypoint_s * np.arange(tuning.waypoints + 1, dtype=np.float64))
+
     def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         slots, aimed = self._wanted_ahead(self._formation, t_s)
+        people = self._people_ahead(t_s)
         for i in range(len(self._plans)):
             made = self._local_planner.plan(
                 t_s,
@@ -205,6 +213,7 @@ class Pilot:
                 slots=slots[:, i],
                 actor=aimed[i],
                 others=[plan for j, plan in enumerate(self._plans) if j != i and plan is not None],
+                people=people,
                 field=field,
                 previous=self._plans[i],
             )
@@ -223,14 +232,15 @@ def replay(
     config: PlannerConfig,
     weights: Sequence[float] = (1.0,),
     names: Sequence[str] = (),
+    seed: int = 0,
 ) -> Replay:
     """Fly an arm against a log.
 
     The drones start in their slots, at rest, and fly what `guard.Guard` admits. `actor` [A, 3] m, world, is
     the middle of the hips, or [A, P, 3] of several people: one actor for most arms, in their weighted middle;
     `group` decides whom each drone films. NaN was not measured; the replay lasts while everybody is. `fields`
-    are the maps by the time from which they hold; before the first nothing is known. ValueError: times that
-    do not ascend, fewer than two measurements, an impossible number of drones.
+    are the maps by the time from which they hold; before the first nothing is known. `seed` draws outages and
+    gusts. ValueError: times that do not ascend, fewer than two measurements, an impossible number of drones.
     """
     people = actor if actor.ndim == 3 else actor[:, None]
     measured_then = np.isfinite(people.sum(axis=2))  # [A, P]
@@ -247,7 +257,7 @@ def replay(
     fields_known = [open_space(), *maps]
     taken_in = np.maximum(np.searchsorted(t_ns, seen_ns, side="right"), first + 1)
     times_s = (replay_ns - t_ns[first]) / 1e9
-    lost = outages(times_s, config.imperfections)
+    lost = outages(times_s, config.imperfections, seed)
     heard = known & ~np.append(lost, False)[np.searchsorted(times_s, log_s).clip(0, len(lost))][:, None]
 
     weight = np.array(weights, dtype=np.float64)
@@ -274,7 +284,7 @@ def replay(
         slots[:, until], aim[:, until] = wanted.swapaxes(0, 1), pilot.aim[:, None]
         position[:, until], velocity[:, until] = guard.fly(until.stop - k)
         k = until.stop
-    position = blown(position, times_s, config)
+    position = blown(position, times_s, config, seed)
     battery_kj = config.imperfections.battery_kj
     return Replay(
         names=tuple(names),
@@ -380,6 +390,7 @@ def fly_arm(scene: ReplayScene, arm: Arm) -> ArmFlight:
         config=scene.config,
         weights=scene.flight.weights,
         names=scene.names,
+        seed=scene.settings.seed,
     )
 
 
@@ -432,14 +443,21 @@ def trajectories(scene: ReplayScene, flown: ArmFlight) -> pd.DataFrame:
     table["tilt_rad"] = _rows(slot_of(flown.position - aimed_at(scene, flown)))[:, TILT]
     table["visible"] = seen.any(axis=0).T.ravel()
     table["predicted_error_m"] = np.repeat(np.where(np.isfinite(error), error, np.nan), count)
+    table["known"] = flown.known.T.ravel()
     return table
 
 
-def flight_from(table: pd.DataFrame, aim: Float, known: Bool, safety: dict[str, int]) -> ArmFlight:
+def flight_from(table: pd.DataFrame, aim: Float, safety: dict[str, int]) -> ArmFlight:
     """Rebuild the flight that `trajectories` stored."""
     names, position, quaternion = poses_from(table)
     slots = _dense(table, _SLOT, len(names))
-    return ArmFlight(names, position, quaternion, slots, aim, known, safety)
+    return ArmFlight(names, position, quaternion, slots, aim, known_from(table, len(names)), safety)
+
+
+def known_from(table: pd.DataFrame, cameras: int) -> Bool:
+    """Return where cameras have a pose and film, [N, T], of stored trajectories."""
+    known: Bool = table["known"].to_numpy(np.bool_).reshape(-1, cameras).T
+    return known
 
 
 def poses_from(table: pd.DataFrame) -> tuple[tuple[str, ...], Float, Float]:

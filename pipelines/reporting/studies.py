@@ -191,10 +191,10 @@ def _table_of_session(metrics: Mapping[str, Any]) -> StudyTable:
     cells = metrics["cells"]
     others = [name for name in metrics["varied"] if name not in _COLUMNS]
     columns = {**dict(list(_COLUMNS.items())[:4]), **dict(zip(others, others, strict=True)), **_COLUMNS}
-    percent = {"pck150", "coverage", "hidden_share"}
+    percent, mark = {"pck150", "coverage", "hidden_share"}, 4 + len(others)
     rows = []
     for cell in cells:
-        row = []
+        row: list[str] = []
         for name in columns:
             value = cell[name]
             if isinstance(value, float):
@@ -203,8 +203,10 @@ def _table_of_session(metrics: Mapping[str, Any]) -> StudyTable:
             if name == "capped_mm" and cell["low_mm"] is not None:
                 value += f" ±{(cell['high_mm'] - cell['low_mm']) / 2:.1f}"
             row.append("-" if value is None else str(value))
-        rows.append([*row, "best" if cell["best"] else "trade-off" if cell["tradeoff"] else ""])
-    return StudyTable("Combinations", [*columns.values(), ""], 4 + len(others), rows)
+        row.insert(mark, "best" if cell["best"] else "trade-off" if cell["tradeoff"] else "")
+        rows.append(row)
+    header = list(columns.values())
+    return StudyTable("Combinations", [*header[:mark], "", *header[mark:]], mark + 1, rows)
 
 
 def _text(cell: Mapping[str, Any], name: str) -> str:

@@ -126,11 +126,13 @@ REPLAN = pa.schema(
         *((name, pa.float64()) for name in _SLOT),
         ("visible", pa.bool_()),
         ("predicted_error_m", pa.float64()),
+        ("known", pa.bool_()),
     ]
 )
 """replan/<arm>/trajectories.parquet: the pose (world_from_camera), the commanded
 slot (yaw continuous, NaN for the flown trajectories), the tilt above the actor, `visible` (True if nothing
-blocks the sight line), and the predicted error of all cameras together (NaN where not determined)."""
+blocks the sight line), the predicted error of all cameras together (NaN where not determined), and `known`
+(False where a log has a gap, or a battery is empty: no pictures there)."""
 
 
 def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:

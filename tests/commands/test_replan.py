@@ -387,6 +387,8 @@ BAD = {
     "unknown arm": (["--arms", "adaptive,clever"], "there are adaptive, fixed, group, joint, flown"),
     "unknown noise": (["--pose-noise", "pink:position_m=1"], "pink"),
     "out of range": (["--config", "horizon_s=600"], "horizon_s"),
+    "no such file": (["--config", "nowhere.yaml"], "nowhere.yaml"),
+    "another file": (["--config", __file__], Path(__file__).name),
 }
 
 

@@ -233,6 +233,7 @@ def test_an_interrupted_study_of_a_session_goes_on_and_ranks_what_is_known(
     again = run(*grid)
     assert "unchanged" in again.output
     assert "trade-off" in again.output
+    assert max(map(len, again.output.split("\nbest is")[0].splitlines())) <= 100
 
 
 def test_a_verdict_says_in_how_many_other_walks_it_holds(calm: Path, tmp_path: Path) -> None:

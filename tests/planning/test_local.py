@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig, PlannerTuning
-from pipelines.planning.distance_field import DistanceField, distance_field
+from pipelines.planning.distance_field import DistanceField, distance_field, open_space
 from pipelines.planning.local import LocalPlanner
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import mound
@@ -37,7 +37,8 @@ def test_the_gradient_is_the_derivative_of_the_cost(seed: int, speed_floor: floa
     position, velocity = rng.normal(size=(2, 3))
     waypoints = position + np.cumsum(rng.normal(size=(20, 3)), axis=0)
     actor = waypoints + rng.normal(size=(20, 3)) * [5, 5, 1]  # some nearer than sight lines begin
-    slots, others = waypoints + rng.normal(size=(20, 3)), waypoints + 2.5 * rng.normal(size=(2, 20, 3))
+    slots, others = waypoints + rng.normal(size=(20, 3)), np.full((2, 20, 4), 3.5)
+    others[..., :3] = waypoints + 2.5 * rng.normal(size=(2, 20, 3))
 
     def cost(moved: Float) -> tuple[float, dict[str, float], Float]:
         return planner.cost(position, velocity, moved, slots=slots, actor=actor, others=others, field=field)
@@ -65,7 +66,31 @@ def test_who_stands_inside_the_mound_gets_out_if_speed_has_a_floor(
     field, inside = mound(), np.array([30.0, 8.6, 3.5])
     assert field.sample(inside)[0] < -0.5
     slots = np.tile(inside, (20, 1))
+    actor, nobody = slots - [0, 9, 2], np.empty((0, 21, 3))
     made = planner.plan(
-        0.0, inside, np.zeros(3), slots=slots, actor=slots - [0, 9, 2], others=[], field=field, previous=None
+        *(0.0, inside, np.zeros(3)),
+        slots=slots,
+        actor=actor,
+        others=[],
+        people=nobody,
+        field=field,
+        previous=None,
     )
     assert (field.sample(made.path[-1])[0] > 0) == gets_out
+
+
+def test_a_plan_goes_round_somebody_who_stands_in_its_way() -> None:
+    """Straight on it would pass them at 0.5 m, and the guard would refuse it for good."""
+    slots = np.linspace([0.5, -8.0, 1.0], [0.5, 8.0, 1.0], 21)[1:]
+    people = np.tile([0.0, 0.0, 1.0], (1, 21, 1))
+    ahead = LocalPlanner(CONFIG).plan(
+        *(0.0, np.array([0.5, -8.0, 1.0]), np.zeros(3)),
+        slots=slots,
+        actor=people[0, 1:],
+        others=[],
+        people=people,
+        field=open_space(),
+        previous=None,
+    )
+    assert np.linalg.norm(ahead.path - people[0], axis=1).min() > CONFIG.actor_distance_m
+    assert ahead.path[-1, 1] > 5.0

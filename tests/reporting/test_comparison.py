@@ -295,4 +295,4 @@ def test_a_study_of_a_session_shows_the_tradeoff() -> None:
     assert table["y"].tolist() == [60, 40, 90]
     assert table["series"].tolist() == ["8 m, 2 drones", "8 m, 3 drones", "12 m, 3 drones"]
     (shown,) = tables(words | {"cells": cells})
-    assert [row[-1] for row in shown.rows] == ["trade-off", "best", ""]
+    assert [row[shown.names - 1] for row in shown.rows] == ["trade-off", "best", ""]
