@@ -1,7 +1,7 @@
 """Arms: their search against its parts, groups, forecasts of the actor, and settings."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,20 +12,15 @@ from scipy.linalg import solve_discrete_are
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.planning.arms import ADAPTIVE, FIXED, GROUP, JOINT, Arm, FormationPlanner, RollingOut
+from pipelines.planning.arms import ADAPTIVE, FIXED, GROUP, JOINT, Arm, RollingOut
 from pipelines.planning.config import SETTINGS, Imperfections, PlannerConfig, planner_config
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.forecast import ActorFilter, Forecast
 from pipelines.planning.formation import (
     FormationPath,
-    best_sequence,
-    cost_map,
     costs_of_slots,
     formation_slots,
-    lattice,
     slot_offsets,
-    wrapped,
-    yaw_set,
 )
 from pipelines.planning.imperfections import aimed
 from pipelines.planning.local import (
@@ -33,8 +28,6 @@ from pipelines.planning.local import (
     INTEGRAL,
     POSITION,
     VELOCITY,
-    DronePlan,
-    Flying,
     flying_of,
     roll_out,
     stopping_ticks,
@@ -46,34 +39,6 @@ from tests.planning.worlds import bare_ground, mound, trees, walker, wall
 
 WORLD = trees()
 WALL = wall(1.0)
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 10_000), st.sampled_from([2, 3, 5]))
-def test_a_plan_is_the_cheapest_sequence_through_the_cost_map(seed: int, drones: int) -> None:
-    rng = np.random.default_rng(seed)
-    config = PlannerConfig()
-    start = float(rng.uniform(-3, 3))
-    actor = rng.uniform([-5, -10, 0.5], [40, 10, 1.5], (config.horizon_knots, 3))
-    form = {"tilt_rad": config.tilt_rad, "range_m": config.radius_m}
-    commanded = formation_slots(np.array([start + rng.uniform(-20, 20)]), drones, **form)[0]
-
-    path = ADAPTIVE.start(config, drones=drones, yaw_rad=start).plan(7.0, commanded, Forecast(actor), WORLD)
-
-    yaws = yaw_set(config.tuning.yaws, start)
-    states = np.stack([yaws, 0 * yaws + config.tilt_rad, 0 * yaws + config.radius_m], axis=1)
-    grid = lattice(
-        states, rates=np.array(config.slot_rates), knot_s=config.tuning.knot_s, w_turn=config.tuning.w_turn
-    )
-    slots = formation_slots(yaws, drones, **form)
-    costs = costs_of_slots(WORLD, actor, slot_offsets(slots), config)
-    assert cost_map(costs, config).max() > 0
-    sequence, _ = best_sequence(cost_map(costs, config), grid, commanded[0])
-    assert path.knot_s == pytest.approx(7.0 + config.tuning.knot_s * np.arange(config.horizon_knots + 1))
-    assert np.array_equal(path.slots[0], commanded)
-    assert path.slots[1:, :, 1:] == pytest.approx(slots[sequence][..., 1:])
-    assert wrapped(path.slots[1:, :, 0] - slots[sequence][..., 0]) == pytest.approx(0.0, abs=1e-12)
-    assert (np.abs(np.diff(path.slots[..., 0], axis=0)) <= np.pi).all()
 
 
 @pytest.mark.parametrize("drones", [2, 5])
@@ -265,39 +230,6 @@ def test_what_cannot_be_meant_is_refused_by_name(values: dict[str, object], name
     assert "unheard_of" in str(error.value)  # all problems in one message
 
 
-def track(plan: DronePlan, start: Float, flying: Flying, seconds: float) -> Float:
-    """Return states [K + 1, 4, 3] of a drone that follows a plan from its start."""
-    ticks = round(seconds / flying.period_s)
-    states = np.zeros((ticks + 1, 4, 3))
-    states[0] = start
-    roll_out(plan.path, plan.velocity, plan.step_s, 0.0, ticks, flying, states)
-    return states
-
-
-def at_rest() -> Float:
-    return np.zeros((4, 3))
-
-
-def test_a_moving_reference_is_followed_closely() -> None:
-    """A circle that needs 2 m/s^2: with the reference's acceleration only the 20 ms steps remain.
-
-    Each step the acceleration held is late by half of one: 0.5 * 0.02 s * |jerk| = 0.02 m/s^2, over
-    k_position = 6 that is 3 mm. Cubic pieces over 0.1 s differ from the circle by less than 0.1 mm. Ten times
-    3 mm are allowed after the transient.
-    """
-    radius, speed = 8.0, 4.0
-    w = speed / radius
-    t = 0.1 * np.arange(110)
-    circle = radius * np.stack([np.cos(w * t), np.sin(w * t), 0 * t], axis=1)
-    start = at_rest()
-    start[POSITION], start[VELOCITY] = circle[0], [0.0, speed, 0.0]
-    start[ACCELERATION] = -(w**2) * circle[0]
-    states = track(DronePlan(0.0, circle, start[VELOCITY], 0.1), start, flying_of(CONFIG), 10.0)
-    t = np.arange(len(states)) / CONFIG.tuning.tracking_hz
-    truth = radius * np.stack([np.cos(w * t), np.sin(w * t), 0 * t], axis=1)
-    assert np.linalg.norm(states[:, POSITION] - truth, axis=1).max() < 0.03
-
-
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 
 
@@ -364,32 +296,6 @@ def test_over_bare_ground_and_in_the_open_nothing_turns_or_climbs(
     result = fly(arm, world(), seconds=12.0, yaw_deg=yaw_deg)
     assert np.abs(tilt_deg(result) - CONFIG.tilt_deg).max() < 3
     assert np.degrees(result.formation_yaw_rad) == pytest.approx(np.full(len(result.t_ns), yaw_deg))
-
-
-@dataclass(frozen=True)
-class SamePlaceForAll:
-    """An arm that wants every drone in the slot of the first one after 3 s."""
-
-    name: str = "same-place"
-    title: str = "all in one slot"
-
-    def start(self, *_: object, **__: object) -> FormationPlanner:
-        return _SamePlace()
-
-
-class _SamePlace:
-    def plan(self, t_s: float, commanded: Float, *_: object, **__: object) -> FormationPath:
-        goal = commanded if t_s < 3 else np.repeat(commanded[:1], len(commanded), axis=0)
-        rates = np.array(CONFIG.slot_rates)
-        return FormationPath(np.array([t_s, t_s + 2.0]), np.stack([commanded, goal]), rates)
-
-
-@pytest.mark.parametrize("drones", [3])
-def test_drones_that_want_the_same_slot_keep_three_metres(drones: int) -> None:
-    result = fly(SamePlaceForAll(), bare_ground(), seconds=20.0, drones=drones)
-    assert np.ptp(result.slots[:, -1, 0]) < 1e-6  # they do want it
-    apart = np.linalg.norm(result.position[:, None] - result.position[None], axis=-1)
-    assert apart[~np.eye(drones, dtype=bool)].min() >= CONFIG.separation_m
 
 
 @pytest.mark.parametrize("arm", [ADAPTIVE, JOINT], ids=lambda arm: arm.name)

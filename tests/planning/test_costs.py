@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import distance_transform_edt
 
 from pipelines.planning.config import ErrorModel, PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import distance_field, in_turn, visible
 from pipelines.planning.formation import (
-    FormationPath,
     cost_map,
     costs_of_slots,
     formation_slots,
@@ -100,6 +100,17 @@ def test_gradient_is_the_derivative_of_the_interpolated_value() -> None:
         assert np.abs(gradient[:, axis] - numeric).max() < 1e-8
 
 
+@given(st.integers(0, 10_000), st.sampled_from([0.01, 0.5, 0.99]))
+def test_distances_are_those_of_scipy(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    occupied = rng.random(rng.integers(2, 15, 3)) < share
+    occupied[0, 0, 0], occupied[1, 1, 1] = True, False
+    expected = distance_transform_edt(~occupied) - distance_transform_edt(occupied)
+    expected = RES * (expected - np.sign(expected) / 2)
+    field = distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES))
+    np.testing.assert_allclose(field.grid.distance_m, expected, rtol=1e-6)
+
+
 def test_cameras_see_through_what_drones_avoid() -> None:
     """Look down through the unknown at a place above the slab: clearance as if occupied, sight as if free."""
     camera, actor = np.array([[0.0, 0.0, 3.8]]), np.array([[0.0, 0.0, 1.3]])
@@ -134,11 +145,3 @@ def test_slots_are_evenly_spaced_but_for_two(drones: int, apart_deg: float) -> N
     offsets = slot_offsets(slots)
     assert np.linalg.norm(offsets, axis=-1) == pytest.approx(np.full((2, drones), 10.0))
     assert offsets[..., 2] == pytest.approx(np.full((2, drones), 10 * np.sin(0.25)))
-
-
-def test_knots_are_approached_at_the_full_rate_and_then_waited_for() -> None:
-    slots = np.array([[[0.0, 0.2, 10.0]], [[np.radians(20), 0.2, 9.0]], [[np.radians(65), 0.2, 9.0]]])
-    path = FormationPath(np.array([5.0, 7.0, 9.0]), slots, RATES)
-    found = path.at(np.array([4.0, 5.0, 5.4, 6.5, 8.0, 9.0, 20.0]))[:, 0]
-    assert np.degrees(found[:, 0]) == pytest.approx([0, 0, 9, 20, 42.5, 65, 65])
-    assert found[:, 2] == pytest.approx([10, 10, 9.6, 9, 9, 9, 9])

@@ -98,24 +98,3 @@ def test_no_drone_of_a_team_has_a_cheaper_sequence(seed: int, drones: int) -> No
         others[:, i] = every
         assert costs(others).min() >= least - 1e-9
     assert least <= min(costs(before[None])[0], costs(formations[every].swapaxes(1, 2)).min()) + 1e-9
-
-
-def test_a_drone_in_trouble_chooses_before_those_who_stand_in_its_way() -> None:
-    """One of two drones can leave the blocked slots only if the other one makes room at the same time."""
-    grid = yaw_ring(16, knot_s=1.0, w_turn=0.05)  # 22.5 deg and as much a second: the neighbours are in reach
-    offsets = slot_offsets(grid.states)  # neighbours are 3.9 m apart, every other one 7.7 m
-    same = np.ascontiguousarray(np.repeat(np.arange(16)[:, None], 2, axis=1))  # equal spacing is of no use
-    views = TeamViews(grid, offsets, np.zeros((16, 6)), same, np.ones(16, dtype=np.bool_))
-    price = np.zeros((8, 16))
-    price[:, 3:9] = 5.0
-    at = np.array([4, 2])
-    teams = best_teams(
-        price,
-        np.ones(price.shape),
-        views,
-        TeamWeights(w_error=0.0, prior=0.25, apart_m=4.5),
-        grid.states[at],
-        np.repeat(at[:, None], 8, axis=1),
-    )
-    blocked = [int((price[np.arange(8), team] > 0).sum()) for team in teams]
-    assert blocked[0] == 1  # at the first knot: two steps lead out
