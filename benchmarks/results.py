@@ -109,7 +109,7 @@ SECTIONS = (
         " Errors are those of joints that all arms measured.",
         (
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
-            Part("planner-worlds", "300 random worlds", MODELLED, ""),
+            Part("planner-worlds", "Random worlds", MODELLED, ""),
             Part("planner-films", "Modelled and filmed differences", RENDERED, KEPT),
             Part("planner-filming", "View quality of published plans, and of ours", REAL, ""),
             Part("planner-groups", "Groups that split", MODELLED, KEPT),
