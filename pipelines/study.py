@@ -657,18 +657,20 @@ def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
     if best["alike"]:
         start = "On average no" if "walks" in best else "No"
         words.append(
-            f"{start} difference worth flying to {'; '.join(_named(rows[k]) for k in best['alike'])}"
+            f"{start} difference worth flying to {'; '.join(_named(rows[k], rows) for k in best['alike'])}"
         )
     for k, counts in enumerate(best.get("walks", ())):
         if k != best["cell"]:
             share = _share_interval(counts["better"], counts["walks"])
             words.append(
-                f"It is better than {_named(rows[k])} in {counts['better']} of {counts['walks']} walks"
+                f"It is better than {_named(rows[k], rows)} in {counts['better']} of {counts['walks']} walks"
                 f" (95 % interval: {share}), worse in {counts['worse']}"
             )
     least = min((row for row in rows if row["tradeoff"]), key=lambda row: float(row["path_m"]))
     if least is not own:
-        words.append(f"Shortest is {_named(least)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm")
+        words.append(
+            f"Shortest is {_named(least, rows)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm"
+        )
     return ". ".join(words)
 
 
@@ -680,8 +682,13 @@ def _share_interval(count: int, of: int) -> str:
     return f"{low:.0f} to {high:.0f} %"
 
 
-def _named(row: dict[str, Any]) -> str:
+def _named(row: dict[str, Any], among: Sequence[dict[str, Any]] = ()) -> str:
+    """Name a combination by its settings; among others by the arm and by what differs."""
     usual = (*_MEASURED, "arm", "actor", "range_m", "tilt_deg", "robots", "best", "tradeoff")
-    others = "".join(f", {name}={value}" for name, value in row.items() if name not in usual)
-    place = f"from {row['range_m']:g} m at {row['tilt_deg']:g} deg"
-    return f"{row['arm']} {place} with {row['robots']} drones{others}"
+    words = {
+        "range_m": f" from {row['range_m']:g} m",
+        "tilt_deg": f" at {row['tilt_deg']:g} deg",
+        "robots": f" with {row['robots']} drones",
+    } | {name: f", {name}={value}" for name, value in row.items() if name not in usual}
+    told = [name for name in words if not among or len({str(other[name]) for other in among}) > 1]
+    return f"{row['arm']}" + "".join(words[name] for name in told)

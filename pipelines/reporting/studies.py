@@ -69,6 +69,7 @@ _COLUMNS = {
     "min_separation_m": "separation m",
     "violations": "violations",
 }
+_ALIKE = {"robots": "{} drones", "tilt_deg": "tilt {:g} deg", "range_m": "{:g} m"}  # said once if all have it
 _SHOWN = (METRICS["mpjpe_mm"], METRICS["reconstructed_share"])  # tables on a session's page
 
 
@@ -189,9 +190,13 @@ def _lines(metrics: Mapping[str, Any]) -> list[tuple[tuple[str, ...], list[Mappi
 
 def _table_of_session(metrics: Mapping[str, Any]) -> StudyTable:
     cells = metrics["cells"]
-    others = [name for name in metrics["varied"] if name not in _COLUMNS]
-    columns = {**dict(list(_COLUMNS.items())[:4]), **dict(zip(others, others, strict=True)), **_COLUMNS}
-    percent, mark = {"pck150", "coverage", "hidden_share"}, 4 + len(others)
+    stated = dict.fromkeys([*list(_COLUMNS)[:4], *metrics["varied"]])
+    names = [name for name in stated if name == "arm" or len({str(cell[name]) for cell in cells}) > 1]
+    columns = {
+        name: _COLUMNS.get(name, name.removeprefix("imperfections."))
+        for name in [*names, *list(_COLUMNS)[4:]]
+    }
+    percent, mark = {"pck150", "coverage", "hidden_share"}, len(names)
     rows = []
     for cell in cells:
         row: list[str] = []
@@ -199,7 +204,7 @@ def _table_of_session(metrics: Mapping[str, Any]) -> StudyTable:
             value = cell[name]
             if isinstance(value, float):
                 shown = f"{100 * value if name in percent else value:.1f}"
-                value = f"{value:g}" if name in others else shown
+                value = f"{value:g}" if name in names else shown
             if name == "capped_mm" and cell["low_mm"] is not None:
                 value += f" ±{(cell['high_mm'] - cell['low_mm']) / 2:.1f}"
             row.append("-" if value is None else str(value))
@@ -230,12 +235,17 @@ def draw(folder: Path, metrics: Mapping[str, Any]) -> None:
 
 def setting(metrics: Mapping[str, Any]) -> str:
     """Describe what was filmed or flown, and the number of trials."""
+    cells = metrics["cells"]
+    alike = [
+        text.format(cells[0][name])
+        for name, text in _ALIKE.items()
+        if len({cell.get(name) for cell in cells}) == 1 and name in cells[0]
+    ]
     if metrics["kind"] == "session":
         walks = f" over {plural(metrics['walks'], 'walk')}" if metrics["walks"] > 1 else ""
-        return f"replays of the flight{walks}, keypoints: {metrics['keypoints']}; trials: {metrics['trials']}"
-    settings, cells = metrics["settings"], metrics["cells"]
-    alike = [f"{cells[0]['robots']} drones"] if len({cell["robots"] for cell in cells}) == 1 else []
-    alike += [f"tilt {cells[0]['tilt_deg']:g} deg"] if len({cell["tilt_deg"] for cell in cells}) == 1 else []
+        made = f"replays of the flight{walks}, keypoints: {metrics['keypoints']}; trials: {metrics['trials']}"
+        return ", ".join([*alike, made])
+    settings = metrics["settings"]
     way = "of walking" if metrics["scenario"] is None else f"of {metrics['scenario']}"
     return (
         ", ".join([*alike, f"{settings['seconds']:g} s {way}, keypoints: {metrics['keypoints']}"])
