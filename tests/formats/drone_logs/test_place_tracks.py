@@ -59,7 +59,6 @@ def test_a_table_of_places_is_read(
     [
         "t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n",  # poses
         "time(millisecond),latitude,longitude,height_above_takeoff(feet)\n1,47,8,3\n",  # a flight record
-        "t,frame\n1,2\n",
     ],
 )
 def test_other_tables_are_no_places(tmp_path: Path, text: str) -> None:
