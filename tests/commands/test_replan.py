@@ -199,6 +199,7 @@ def test_what_is_stored(mound: Path, at_the_mound: dict[str, Any]) -> None:
         assert abs(len(table) - 2 * 26 * 50) < 2 * 50
         assert np.degrees(table["tilt_rad"]).max() == pytest.approx(arm["tilt_deg"]["max"])
         assert 1 - table["visible"].mean() == pytest.approx(arm["occluded_share"])
+        assert table["known"].all()  # no gap, no empty battery
 
 
 def test_unchanged_is_skipped_and_forced_is_the_same(calm: Path) -> None:
