@@ -733,10 +733,12 @@ def poses_of_pictures(laid: LaidMap, t_ns: Int64, places: Float, at_ns: Int64) -
     beside = places - path(np.clip(logged_s, 0, key_s[-1]))
     near = (logged_s >= 0) & (logged_s <= key_s[-1])
     gap_ns = round(MAX_PLACE_GAP_S * 1e9)
-    shift = interpolate_points(t_ns[near], beside[near], at_ns, max_gap_ns=gap_ns)
+    # Before the first place and after the last, the map goes on for half of such a gap.
+    held_ns = np.clip(at_ns, *t_ns[near][[0, -1]])
+    shift = interpolate_points(t_ns[near], beside[near], held_ns, max_gap_ns=gap_ns)
     inside = np.clip(asked_s, 0, key_s[-1])
     position = path(inside) + shift
     quaternion = RotationSpline(key_s, Rotation.from_quat(laid.quaternion_xyzw))(inside).as_quat()
     known = (asked_s >= 0) & (asked_s <= key_s[-1]) & _bridged(laid.t_ns, at_ns)
-    known &= np.isfinite(position).all(axis=1)
+    known &= np.isfinite(position).all(axis=1) & (2 * np.abs(at_ns - held_ns) <= gap_ns)
     return np.where(known[:, None], position, np.nan), np.where(known[:, None], quaternion, np.nan)

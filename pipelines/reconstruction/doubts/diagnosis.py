@@ -587,7 +587,7 @@ def _is_explained(causes: Sequence[Tried]) -> bool:
         return False
     first = causes[0]
     fits = first.score is not None and first.score.misfit < MISSED
-    return first.numbers == 0 or (first.alternative.code == "mount" and fits)
+    return first.numbers == 0 or (first.alternative.code in ("mount", "intrinsics") and fits)
 
 
 def _of_looks(trial: Trial, looks: Mapping[int, Callable[[], tuple[float, float] | None]]) -> list[Tried]:
