@@ -19,6 +19,8 @@ F = TypeVar("F")
 
 # Every kind is known by less than its first 64 kB.
 HEAD_BYTES = 64 * 1024
+# Of an ending that more kinds of files have, the first bytes say more.
+_MOST_KINDS = 2
 # Larger text takes seconds to parse, and is described by its first line.
 MAX_PARSED_BYTES = 8 << 20
 # A line with more names of keys, columns or endings is not read to its end.
@@ -214,8 +216,9 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
         return None
     if not is_control:
         return Likeness("is text, but not UTF-8", "save it as UTF-8")
-    if kinds := [f.title for f in FORMATS.all() if path.suffix and path.suffix.lower() in f.suffixes]:
-        return Likeness(f"is called {path.suffix} but is no {_listed(kinds)} that can be read", _COPY)
+    kinds = [f.title for f in FORMATS.all() if path.suffix and path.suffix.lower() in f.suffixes]
+    if 0 < len(kinds) <= _MOST_KINDS:
+        return Likeness(f"is called {path.suffix} but is no {' or '.join(kinds)} that can be read", _COPY)
     return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
 
 

@@ -10,8 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from pipelines.formats.common.rows import METRES
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
-from pipelines.formats.skeletons.joint_files import METRES, joint_names
+from pipelines.formats.skeletons.joint_files import joint_names
 from pipelines.formats.videos.frame_times import FrameTimesFormat
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import (

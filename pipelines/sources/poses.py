@@ -12,11 +12,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipelines.formats.common.rows import median_step_ns
+from pipelines.formats.common.rows import METRES, median_step_ns
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.logs.positions import FIXES, read_pair, read_positions
 from pipelines.formats.maps.voxel_grids import placed
-from pipelines.formats.skeletons.joint_files import METRES
 from pipelines.geometry.arrays import ClockFit, Float, Int64, Place
 from pipelines.geometry.geodesy import enu_from_enu, enu_from_geodetic
 from pipelines.geometry.mounting import attitude_in_enu, compose_gimbal, level_heading

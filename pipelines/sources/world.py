@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.formats.common.rows import METRES
 from pipelines.formats.maps.voxel_grids import placed
-from pipelines.formats.skeletons.joint_files import METRES
 from pipelines.geometry.arrays import Float, Int64, Place
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import FLU_FROM_FRD, body_from_camera

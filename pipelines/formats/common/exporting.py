@@ -1,6 +1,7 @@
 """Parts that exports share: names of files, tables, chosen times, maps and covariances for viewers."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,14 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MapSurface, surface_of
-from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory, full_covariance
+from pipelines.session.records import (
+    JointMotion,
+    MovingBody,
+    Occupancy,
+    Recording,
+    Trajectory,
+    full_covariance,
+)
 
 CHI2_95 = 7.815
 """An ellipsoid {x : x' S^-1 x = 7.815} holds 95 % of a Gaussian in three dimensions (chi-square)."""
@@ -49,10 +57,17 @@ def file_names_of_people(recording: Recording, people: int) -> list[str]:
     return names
 
 
-def no_body(recording: Recording) -> DataError:
-    """Make the error of a recording in which nobody has a body."""
-    remedy = "run `mocap reconstruct`; a body needs hips, shoulders and ten landmarks of a person"
-    return DataError(recording.name, "holds no body to export", remedy, code="no-body")
+def bodies_of(recording: Recording, export: str) -> tuple[JointMotion, Sequence[MovingBody]]:
+    """Return motion and bodies, and note who has joints but no body; DataError: nobody has one."""
+    bodies, motion = recording.bodies(), recording.motion
+    if motion is None or not bodies:
+        remedy = "run `mocap reconstruct`; a body needs hips, shoulders and ten landmarks of a person"
+        raise DataError(recording.name, "holds no body to export", remedy, code="no-body")
+    seen = np.flatnonzero(np.isfinite(motion.position).any(axis=(0, 2, 3))).tolist()
+    without = [recording.name_of(person) for person in sorted({*seen} - {body.person for body in bodies})]
+    if without:
+        recording.progress.note(f"{export}: no body is known of {', '.join(without)}, left out")
+    return motion, bodies
 
 
 def tracks_of(recording: Recording) -> dict[str, Trajectory]:

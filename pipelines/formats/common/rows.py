@@ -28,6 +28,9 @@ _DATE = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?(Z|[+-
 # Stamps count from this moment.
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+"""Units of length, in metres."""
+
 NORM_TOLERANCE = 0.1
 """Largest deviation of a quaternion from unit length: up to this rounding explains it, beyond not."""
 

@@ -95,9 +95,8 @@ def _number(text: str) -> float:
 def _columns(text: str) -> tuple[Heading, dict[str, int], bool] | None:
     """Return the heading of a table of places, its three columns, and True for degrees; None without."""
     heading = find_heading(text.partition("\n")[0])
-    if (
-        heading is None or (_ATTITUDE | {"joint", "keypoint"}) & heading.names.keys()
-    ):  # poses, or joints of people
+    of_others = _ATTITUDE | {"joint", "keypoint"}  # poses, or joints of people
+    if heading is None or of_others & heading.names.keys():
         return None
     for on_earth, wanted in ((True, _ON_EARTH), (False, _METRES)):
         columns = {

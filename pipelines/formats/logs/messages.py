@@ -6,6 +6,7 @@ this module alone handles. A sample with `stamp_ns` 0 has only the time of its r
 
 import base64
 import operator
+from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -416,3 +417,34 @@ class LoggedRows:
                 f" those of receipt; {used}, not corrected (logs: clock: drift_ppm does)"
             )
         return [f"{place}: {note}" for note in notes]
+
+
+class Samples:
+    """Samples of one body, gathered into flat arrays."""
+
+    def __init__(self) -> None:
+        self._header_ns = array("q")
+        self._receive_ns = array("q")
+        self._values = array("d")
+        self._covariances = array("d")
+
+    def add(self, header_ns: int, receive_ns: int, values: Iterable[float]) -> None:
+        """Add one sample; the number of values must always be the same."""
+        self._header_ns.append(header_ns)
+        self._receive_ns.append(receive_ns)
+        self._values.extend(values)
+
+    def add_pose(self, pose: PoseSample) -> None:
+        """Add one pose; either all poses have a covariance or none."""
+        self.add(pose.stamp_ns, pose.receive_ns, pose.position + pose.quaternion_xyzw)
+        if pose.covariance is not None:
+            self._covariances.frombytes(pose.covariance.tobytes())
+
+    def rows(self, width: int) -> LoggedRows:
+        """Return the rows, with `width` values each."""
+        return LoggedRows(
+            header_ns=np.frombuffer(self._header_ns, dtype=np.int64),
+            receive_ns=np.frombuffer(self._receive_ns, dtype=np.int64),
+            values=np.frombuffer(self._values, dtype=np.float64).reshape(-1, width),
+            covariance=np.frombuffer(self._covariances, dtype=np.float64).reshape(-1, 36),
+        )

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import attitude_track, position_track
-from pipelines.formats.logs.messages import FAULTS, LoggedRows, Stamps, nanoseconds, unreadable
-from pipelines.formats.logs.trajectories import Samples
+from pipelines.formats.logs.messages import FAULTS, LoggedRows, Samples, Stamps, nanoseconds, unreadable
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes

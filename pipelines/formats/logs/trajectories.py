@@ -14,7 +14,16 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.logs.messages import Edge, LoggedRows, Source, Stamps, all_samples, kind_of, samples
+from pipelines.formats.logs.messages import (
+    Edge,
+    LoggedRows,
+    Samples,
+    Source,
+    Stamps,
+    all_samples,
+    kind_of,
+    samples,
+)
 from pipelines.formats.logs.recordings import LogPart, OpenLog, begins_like, open_parts
 from pipelines.formats.poses import clean_poses
 from pipelines.geometry.arrays import Int64
@@ -66,37 +75,6 @@ class TransformLog:
 
     moving: Mapping[Edge, LoggedRows]
     static: Mapping[Edge, LoggedRows]
-
-
-class Samples:
-    """Samples of one body, gathered into flat arrays."""
-
-    def __init__(self) -> None:
-        self._header_ns = array("q")
-        self._receive_ns = array("q")
-        self._values = array("d")
-        self._covariances = array("d")
-
-    def add(self, header_ns: int, receive_ns: int, values: Iterable[float]) -> None:
-        """Add one sample; the number of values must always be the same."""
-        self._header_ns.append(header_ns)
-        self._receive_ns.append(receive_ns)
-        self._values.extend(values)
-
-    def add_pose(self, pose: PoseSample) -> None:
-        """Add one pose; either all poses have a covariance or none."""
-        self.add(pose.stamp_ns, pose.receive_ns, pose.position + pose.quaternion_xyzw)
-        if pose.covariance is not None:
-            self._covariances.frombytes(pose.covariance.tobytes())
-
-    def rows(self, width: int) -> LoggedRows:
-        """Return the rows, with `width` values each."""
-        return LoggedRows(
-            header_ns=np.frombuffer(self._header_ns, dtype=np.int64),
-            receive_ns=np.frombuffer(self._receive_ns, dtype=np.int64),
-            values=np.frombuffer(self._values, dtype=np.float64).reshape(-1, width),
-            covariance=np.frombuffer(self._covariances, dtype=np.float64).reshape(-1, 36),
-        )
 
 
 # --- poses -----------------------------------------------------------------------------------------------

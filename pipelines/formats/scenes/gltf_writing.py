@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.exporting import no_body, safe_file_name, thinned
+from pipelines.formats.common.exporting import bodies_of, safe_file_name, thinned
 from pipelines.geometry.arrays import Float, Int64, Intrinsics, nearest_rows
 from pipelines.geometry.body_model import body_model
 from pipelines.geometry.poses import continuous_signs, multiply
@@ -262,10 +262,8 @@ class MeshExport:
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write the bodies at the times of the skeleton."""
-        bodies = recording.bodies()
-        if recording.motion is None or not bodies:
-            raise no_body(recording)
-        motion_ns = recording.motion.t_ns
+        motion, bodies = bodies_of(recording, self.name)
+        motion_ns = motion.t_ns
         t_ns = motion_ns[thinned(motion_ns, KEY_FRAMES_HZ)]
         if len(t_ns) < len(motion_ns):
             recording.progress.note(

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.exporting import no_body, people_of
+from pipelines.formats.common.exporting import bodies_of, people_of
 from pipelines.formats.common.files import read_head
 from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints, describe_motion
 from pipelines.geometry.arrays import Bool, Float, Int64
@@ -52,6 +52,8 @@ _LARGEST = 1e9
 _LONGEST_S = 3600
 # Between poses of a body that are further apart nothing is interpolated.
 _LONGEST_GAP_NS = 200_000_000
+# Frames of slow recordings are further apart, and so are poses by up to so many frames.
+_LONGEST_STEP = 1.5
 _MOST_STRETCH_M = 0.05
 """Largest movement of a bone against its parent, either way, for which its mean position is used."""
 
@@ -351,9 +353,7 @@ class BvhExport:
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write every person who has a body; a note says what was left out or held."""
         motion, files = people_of(recording, folder, ".bvh")
-        bodies = [body for body in recording.bodies() if body.person in files]
-        if not bodies:
-            raise no_body(recording)
+        bodies = [body for body in bodies_of(recording, self.name)[1] if body.person in files]
         t_ns = at_even_times("bvh", motion, recording.progress).motion.t_ns
         for body in bodies:
             path = files[body.person]
@@ -446,8 +446,11 @@ _OF_BODY = {
 
 def rig_of_body(body: MovingBody, t_ns: Int64) -> tuple[SkeletalMotion, int]:
     """Take a body, known at one of the times [T], as a rig from its first to its last; count held frames."""
-    half_step_ns = int(np.diff(t_ns).max(initial=0)) // 2 + 1  # some frame is so near to any pose
-    limits = {"max_gap_ns": _LONGEST_GAP_NS, "max_extrapolation_ns": half_step_ns}
+    step_ns = int(np.diff(t_ns).max(initial=0))
+    limits = {
+        "max_gap_ns": max(_LONGEST_GAP_NS, round(_LONGEST_STEP * step_ns)),
+        "max_extrapolation_ns": step_ns // 2 + 1,  # some frame is so near to any pose
+    }
     moved = [
         interpolate_poses(body.t_ns, body.centre[:, bone], body.rotation[:, bone], t_ns, **limits)
         for bone in range(len(BONES))

@@ -18,8 +18,8 @@ import pandas as pd
 
 from pipelines.formats.common.exporting import people_of
 from pipelines.formats.common.files import first_bytes
+from pipelines.formats.common.rows import METRES
 from pipelines.formats.skeletons.joint_files import (
-    METRES,
     EvenMotion,
     at_even_times,
     describe_motion,

@@ -19,6 +19,7 @@ from pipelines.formats.common.exporting import (
 )
 from pipelines.formats.common.files import TextFormat
 from pipelines.formats.common.rows import (
+    METRES,
     SECONDS,
     Heading,
     TextTable,
@@ -40,7 +41,6 @@ from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
 from pipelines.session.storage import damaged, read_text
 
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 AXES = ("z-up", "y-up")
 # A hand at 2 m/s moves by 1 mm in this time, so a sample so near keeps its position.
 _KEPT_NS = 500_000

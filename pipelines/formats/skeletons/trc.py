@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import people_of
-from pipelines.formats.common.rows import format_seconds, median_step_ns, parse_stamps
+from pipelines.formats.common.rows import METRES, format_seconds, median_step_ns, parse_stamps
 from pipelines.formats.skeletons.joint_files import (
-    METRES,
     JointFile,
     joint_names,
     marker_name,

@@ -204,17 +204,24 @@ def test_a_body_is_written_from_its_first_to_its_last_pose(tmp_path: Path) -> No
     known = np.array([k for k in range(30) if k not in {0, 1, *range(10, 17), 29}])
     body = replace(whole, t_ns=whole.t_ns[known], centre=whole.centre[known], rotation=whole.rotation[known])
     listener = Listener()
-    described = replace(recording(), motion=motion, bodies=lambda: [body], progress=listener)
+    two = replace(motion, position=np.repeat(motion.position, 2, axis=1), covariance=None)
+    described = replace(recording(), motion=two, bodies=lambda: [body], progress=listener)
     (path,) = bvh.EXPORT.write(described, tmp_path)
     back = read_motion(path, unit="cm", axes="y-up")
     rig, _ = bvh.rig_of_body(body, motion.t_ns)
     place = joint_places(back)[0][:, [back.bones.index(bone) for bone in rig.bones]]
     np.testing.assert_allclose(place[[0, 7, 15]], whole.centre[[2, 9, 17]], rtol=0, atol=2e-6)
     np.testing.assert_allclose(place[8:15], place[[7] * 7], rtol=0, atol=2e-6)
-    (note,) = listener.notes
+    without, note = listener.notes
+    assert described.name_of(1) in without
     assert re.findall(r"(\d+) of (\d+) frames", note) == [("3", "30"), ("7", "27")]
 
 
 def test_nobody_without_a_body_is_written(tmp_path: Path) -> None:
     with refused("no-body", recording().name):
         bvh.EXPORT.write(recording(), tmp_path)
+
+
+def test_a_body_of_slow_pictures_is_written_whole() -> None:
+    t_ns = np.arange(8) * 250_000_000 + np.arange(8) % 3 * 200_000
+    assert bvh.rig_of_body(body_of(t_ns), np.arange(8) * 250_000_000)[1] == 0
