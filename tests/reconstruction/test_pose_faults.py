@@ -44,7 +44,16 @@ def scene(cameras: int) -> SceneOfMoments:
     rays = local[..., :2] / local[..., 2:]
     sigma = np.repeat(SIGMA[None], cameras, axis=0)
     focal_px, person_px = np.full(cameras, 760.0), np.full(cameras, 140.0)
-    return SceneOfMoments(rays, position, rotation, focal_px, sigma, person_px, np.zeros(cameras))
+    return SceneOfMoments(
+        rays,
+        position,
+        rotation,
+        focal_px,
+        sigma,
+        person_px,
+        np.zeros(cameras),
+        np.zeros((cameras, len(rays[0]))),
+    )
 
 
 @pytest.mark.parametrize(

@@ -455,11 +455,23 @@ class Objective:
         pictures = float(self._pictures.sum())
         return 2 * pictures * float(np.log1p(cost / pictures)) / COST_OF_SCORE + surprise(unposed(scene))
 
+    def _cost_of_pictures(self, scene: SceneOfMoments) -> float:
+        """Return the chi^2 of the description in the pictures that a scene shows, for as many as it has."""
+        described = self.trial.described
+        seen = np.isfinite(described.rays[..., 0]).any(axis=2)
+        shown = np.where(np.isfinite(scene.rays[..., 0]).any(axis=2), scene.stated_ns, np.nan)
+        begin, end = (bound.reduce(shown, axis=1, keepdims=True) for bound in (np.fmin, np.fmax))
+        kept = seen & (described.stated_ns >= begin) & (described.stated_ns <= end)
+        if not kept.any():
+            return np.inf
+        rays = np.where(kept[..., None, None], described.rays, np.nan)
+        return self._fit(replace(described, rays=rays)).cost * float(seen.sum() / kept.sum())
+
     def compared(self, tried: Tried) -> Compared:
         """Return the objective of the description, and that of an alternative with its price.
 
-        Another clock leaves moments out: then the description is judged by the same moments. Larger errors
-        excuse everything: of them only the chi^2 counts.
+        Other times leave moments and pictures out: then the description is judged by the same ones, since
+        those left out may show somebody else. Larger errors excuse everything: of them only the chi^2 counts.
         """
         scene, described = tried.alternative.scene, self.trial.described
         if scene is None or tried.score is None:
@@ -467,7 +479,7 @@ class Objective:
         before, total = self.described.cost, self.base.total
         if tried.alternative.code in (*TIMES, "videos_swapped"):
             same = self._at_moments_of(scene)
-            before = self._fit(same).cost
+            before = min(self._fit(same).cost, self._cost_of_pictures(scene))
             total = min(total, score(self.trial.flight, same, self.base).total)
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
         if tried.alternative.alike:

@@ -63,6 +63,7 @@ class SceneOfMoments:
     sigma: Float  # [C, 6] as `PoseSigma`
     person_px: Float  # [C] height of the person in the pictures, median
     unposed: Float  # [C] share of a camera's pictures before or after its log; NaN of one that stands still
+    stated_ns: Float  # [C, T] when the pictures that the moments show were taken, as described
 
 
 class Sampled(NamedTuple):
@@ -257,6 +258,8 @@ def scene_of(
     """
     cameras = flight.cameras
     rays, person_px, unposed = np.empty((len(cameras), len(flight.t_ns), len(JOINTS), 2)), [], []
+    moments = (flight.t_ns - flight.t_ns[0]).astype(np.float64)
+    stated_ns = np.tile(moments, (len(cameras), 1))
     for index, camera in enumerate(cameras):
         source = cameras[index if order is None else order[index]]
         seen = source.pixels if pixels is None else pixels[index]
@@ -270,7 +273,8 @@ def scene_of(
         first = float(source.entry.frames.first_t_ns - flight.t_ns[0])  # few may have been looked at
         since = first + (since - first) * factor + late * 1e9
         unposed.append(_outside(since + flight.t_ns[0], camera, flight.between))
-        at = _interpolated(since, seen, (flight.t_ns - flight.t_ns[0]).astype(np.float64))
+        stated_ns[index] = first + (moments - late * 1e9 - first) / factor
+        at = _interpolated(since, seen, moments)
         rays[index] = undistort(at, camera.intrinsics)
         row = at[..., 1]
         person_px.append(median(np.fmax.reduce(row, axis=1) - np.fmin.reduce(row, axis=1)))
@@ -283,6 +287,7 @@ def scene_of(
         np.array([camera.sigma for camera in cameras]),
         np.nan_to_num(np.array(person_px)),
         np.array(unposed),
+        stated_ns,
     )
 
 
