@@ -229,7 +229,8 @@ class FileSource(Guess):
         known = option_names(self.part)
         for key in self.options:
             if key not in known:
-                raise ValueError(f"{key}: {unknown_key(key, [*type(self).model_fields, *known])}")
+                own = [field.alias or name for name, field in type(self).model_fields.items()]
+                raise ValueError(f"{key}: {unknown_key(key, [*own, *known])}")
         if self.needs_file and not self.file:
             raise ValueError("file: is missing")
         return self
