@@ -546,7 +546,7 @@ class FlightPoses:
         stated, reader = times.file, self._files.format_of("frame_times", times)
         if not isinstance(reader, TriggerFormat):
             return None
-        if camera.pose.file == stated:
+        if camera.pose.file == stated and self._is_joined(camera.pose):
             choice = self._files.options("pose", camera.pose, TelemetryChoice)
         t_ns = reader.picture_times(self._one_file(stated), choice)
         return self._world_times(stated, t_ns, int(t_ns[0]))
