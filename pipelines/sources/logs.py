@@ -109,7 +109,9 @@ class FlightLog:
                 remedy = f"name the attitudes beside it, attitude: {turned}; {remedy}"
             raise DataError(self.source, problem, remedy, code="no-such-topic")
         if len(there) != 1:
-            problem = f"has {len(there)} topics with {noun} ({listed})"
+            problem = (
+                f"has {len(there)} topics with {noun} ({listed})" if there else f"has no topic with {noun}"
+            )
             remedy = "say which with `topic:`" if there else "name another log"
             raise DataError(self.source, problem, remedy, code="ambiguous")
         self.note(f"{self.source}: took {noun} from {there[0]}, the only candidate")
