@@ -28,6 +28,16 @@ SecondsAsNs = Annotated[int, BeforeValidator(nanoseconds)]
 """Seconds in the file (number or text), exact nanoseconds in the program."""
 
 
+_RENAMED = {
+    **dict.fromkeys(("path", "log", "csv", "srt", "tum", "static", "dji", "ulog", "ardupilot"), "file"),
+    **dict.fromkeys(("tlog", "gopro", "joints"), "file"),
+    "fixed": "yaw_deg",
+    "body_from_camera": "rotation_xyzw",
+    "world_from_log": "world_from_source",
+}
+"""Keys of earlier versions of flight.yaml, with their names today."""
+
+
 class YamlModel(BaseModel):
     """A mapping of the manifest: unknown keys are refused, numbers are finite."""
 
@@ -40,8 +50,11 @@ class YamlModel(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _expand_shorthand(cls, value: object) -> object:
-        return {cls.shorthand: value} if cls.shorthand and isinstance(value, str | list) else value
+    def _by_its_keys(cls, value: object) -> object:
+        """Expand a shorthand, and read keys by the names that they had before 0.1.0."""
+        if cls.shorthand and isinstance(value, str | list):
+            return {cls.shorthand: value}
+        return _by_todays_names(value, keys_of(cls)) if isinstance(value, dict) else value
 
     @field_validator("*", mode="before")
     @classmethod
@@ -57,6 +70,17 @@ class YamlModel(BaseModel):
         if self.one_of and len(stated) != 1:
             raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
         return self
+
+
+def _by_todays_names(value: dict[object, object], known: set[str]) -> dict[object, object]:
+    found: dict[object, object] = {}
+    for key, each in value.items():
+        name = key if key in known else _RENAMED.get(str(key), key)
+        if name == "file" != key and isinstance(each, dict):  # options stood below the file's kind
+            found |= each
+        else:
+            found[name if name in known and name not in value else key] = each
+    return found if found == value else _by_todays_names(found, known)
 
 
 def _holds_truth_value(value: object) -> bool:

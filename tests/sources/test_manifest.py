@@ -124,3 +124,17 @@ def test_a_mount_belongs_to_the_pose_of_a_body(flight: SyntheticFlight, change: 
     with pytest.raises(DataError) as caught:
         checked(flight, change)
     assert caught.value.code == "wrong-option"
+
+
+def test_keys_of_earlier_versions_are_read(flight: SyntheticFlight) -> None:
+    def read(pose: dict[str, Any]) -> Any:
+        cameras = flight.settings["cameras"]
+        changed = {**cameras["drone1"], "pose": pose, "mount": None}
+        settings = {**flight.settings, "cameras": {**cameras, "drone1": changed}}
+        path = flight.manifest.with_name("earlier.yaml")
+        SyntheticFlight(path, settings, *list(vars(flight).values())[2:]).save()
+        return read_flight(path).cameras["drone1"].pose
+
+    today = read({"file": "drone1.tum", "of": "camera"})
+    assert read({"tum": "drone1.tum", "of": "camera"}) == today
+    assert read({"static": {"path": "drone1.tum", "of": "camera"}}) == today
