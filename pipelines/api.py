@@ -65,7 +65,10 @@ def skeleton(session: Path) -> pd.DataFrame:
 
 
 def angles(session: Path) -> pd.DataFrame:
-    """Read the joint angles of a session in degrees, a row for each person, angle and time."""
+    """Read the joint angles of a session in degrees, a row for each person, angle and time.
+
+    NaN where an angle is not known; DataError as of `skeleton`.
+    """
     return _reconstructed(session, "angles", ANGLES)
 
 

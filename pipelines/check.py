@@ -53,7 +53,10 @@ def check(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Checked:
-    """Check a session, or a flight by its manifest; `detector` looks at pictures without keypoints."""
+    """Check a session, or a flight by its manifest; `detector` looks at pictures without keypoints.
+
+    `pose_noise` replaces that of flight.yaml. DataError: the flight cannot be read, or nobody is seen.
+    """
     progress = progress or Silent()
     return_freed_arrays()
     with tempfile.TemporaryDirectory(prefix="mocap-check-") as folder:

@@ -218,7 +218,7 @@ class Subtitles:
         return int(self.clock_ns[shown[0]] - self.media_ns[shown[0]]) if len(shown) else None
 
     def focal_35_mm(self) -> float | None:
-        """The last focal length on 36 mm film: `[focal_len: 24.00]` mm, `[focal_len : 280]` in tenths."""
+        """Return the last focal length, mm on 36 mm film: `[focal_len: 24.00]`, or `280` in tenths."""
         found = re.search(r"\[focal_len *: *(\d+(?:\.\d+)?)", self.texts[-1])
         stated = float(found[1]) if found else 0.0
         return (stated / 10 if stated > MAX_FOCAL_35_MM else stated) or None

@@ -260,9 +260,8 @@ def _read_csv(path: Path, unit: str | None, axes: str | None) -> JointMotion:
 
     Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope),
     and FreeMoCap's with a row for each frame and keypoint, in mm. Without a time their frames are counted.
-    Metres and z up unless the user states otherwise. Rows of single
-    joints may come in any order; people are ranked by their number. A position that is blank, infinite or
-    absent is missing (NaN).
+    Metres and z up unless the user states otherwise. Rows of single joints may come in any order; people are
+    ranked by their number. A position that is blank, infinite or absent is missing (NaN).
     """
     text = read_text(path)
     if _is_freemocap(text):
