@@ -34,6 +34,7 @@ _RENAMED = {
     "fixed": "yaw_deg",
     "body_from_camera": "rotation_xyzw",
     "world_from_log": "world_from_source",
+    "start_from": "start",
 }
 """Keys of earlier versions of flight.yaml, with their names today."""
 
@@ -76,7 +77,7 @@ def _by_todays_names(value: dict[object, object], known: set[str]) -> dict[objec
     found: dict[object, object] = {}
     for key, each in value.items():
         name = key if key in known else _RENAMED.get(str(key), key)
-        if name == "file" != key and isinstance(each, dict):  # options stood below the file's kind
+        if name == "file" != key and name in known and isinstance(each, dict):  # options stood below the file's kind
             found |= each
         else:
             found[name if name in known and name not in value else key] = each
