@@ -19,7 +19,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import compose, invert, matrix_from_quaternion, multiply, quaternion_from_matrix
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.alternatives import changed
-from pipelines.reconstruction.doubts.diagnosis import diagnose
+from pipelines.reconstruction.doubts.diagnosis import TIMES, diagnose
 from pipelines.reconstruction.doubts.scene import Oddity, SceneOfMoments, scene_of
 from pipelines.reconstruction.doubts.score import score
 from pipelines.reconstruction.doubts.turning import Lateness
@@ -488,6 +488,16 @@ def test_one_camera_that_no_single_fault_explains_is_named(flight: Described) ->
     backwards = of_poses(lambda pose: (pose[0][::-1], pose[1][::-1]), "drone1")
     first = doubts_of(mistaken(flight, backwards))[0]
     assert (first["code"], first["cameras"]) == ("pose", ["drone1"])
+
+
+def test_somebody_else_in_the_last_pictures_is_no_other_clock(flight: Described) -> None:
+    sampled = sampled_of(mistaken(flight, None))._replace(hips=None)
+    first, *others = sampled.cameras
+    pixels = first.pixels.copy()
+    pixels[-len(pixels) // 3 :] += [150, 0]
+    found = diagnose(sampled._replace(cameras=(replace(first, pixels=pixels), *others)))
+    assert found
+    assert not {doubt.code for doubt in found}.intersection(TIMES)
 
 
 def test_film_has_no_keys_of_keypoints(flight: Described) -> None:
