@@ -77,12 +77,10 @@ def _by_todays_names(value: dict[object, object], known: set[str]) -> dict[objec
     found: dict[object, object] = {}
     for key, each in value.items():
         name = key if key in known else _RENAMED.get(str(key), key)
-        if (
-            name == "file" != key and name in known and isinstance(each, dict)
-        ):  # options stood below the file's kind
-            found |= each
+        if key != name == "file" and name in known and isinstance(each, dict):
+            found |= each  # options stood below the file's kind
         else:
-            found[name if name in known and name not in value else key] = each
+            found[name if name in known and name not in {*value, *found} else key] = each
     return found if found == value else _by_todays_names(found, known)
 
 

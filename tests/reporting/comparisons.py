@@ -71,6 +71,7 @@ def make_arm(arm: str) -> pd.DataFrame:
         table["visible"] = ~hidden
         alone = (arm == "fixed") & (t_s >= HIDDEN_S[0]) & (t_s < HIDDEN_S[1])
         table["predicted_error_m"] = np.where(alone, np.nan, {"adaptive": 0.3}.get(arm, 0.5))
+        table["known"] = True
         tables.append(table[REPLAN.names])
     rows: pd.DataFrame = pd.concat(tables).sort_values(["t_ns", "camera"]).reset_index(drop=True)
     return rows
