@@ -177,6 +177,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, name
     """Print a plain table: text aligned left, numbers right, `-` for a missing value.
 
     A table wider than a terminal is printed in parts below each other, each with the first `names` columns.
+    A text in the last column stays where it is.
     """
     texts = [[_cell(value) for value in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(header, *texts, strict=True)]
@@ -186,7 +187,8 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, name
     ]
     parts, used = [list(range(names))], sum(widths[:names]) + 2 * names
     for k, width in enumerate(widths[names:], start=names):
-        if used + width > TERMINAL_COLUMNS and len(parts[-1]) > names:
+        is_open = k == len(widths) - 1 and not numeric[k]  # a text at the end, such as a path, may be long
+        if used + width > TERMINAL_COLUMNS and len(parts[-1]) > names and not is_open:
             parts.append(list(range(names)))
             used = sum(widths[:names]) + 2 * names
         parts[-1].append(k)
