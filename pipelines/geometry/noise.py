@@ -290,8 +290,6 @@ class PoseErrors:
     """True if white errors have the logged covariance of each pose; `white` is then its level."""
     assumed: bool = False
     """True if nobody knows the level of the constant errors, and `processes` have a wide one."""
-    change: tuple[float, float] = (0.0, 0.0)
-    """Standard deviation (m, rad) of how much the errors grow evenly from the first picture to the last."""
 
     def later(self, elapsed_s: float) -> PoseErrors:
         """Return the same errors some seconds after the start, when a drift has a size already."""

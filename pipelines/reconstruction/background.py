@@ -401,16 +401,12 @@ def _remaining(draws: Float, period_s: float, shift: float) -> PoseErrors:
     """Describe errors [M, T, 6] drawn from the posterior as white, constant and slow; add `shift` (m).
 
     Differences of neighbours beyond those of pictures two apart are white, the mean over the flight is
-    constant, the rest a Gauss-Markov process with the lag at which it has lost 1 / e. Straight lines
-    through them give the change over the flight.
+    constant, the rest a Gauss-Markov process with the lag at which it has lost 1 / e.
     """
-    white, change, processes = [0.0, 0.0], [0.0, 0.0], []
-    line = np.linspace(-0.5, 0.5, draws.shape[1])
+    white, processes = [0.0, 0.0], []
     for kind, number in enumerate((SHIFT_IN_WORLD, ROTATION)):
         part = draws[..., _KINDS[kind]]
         whole, constant = float(np.mean(part**2)), float(np.mean(part.mean(axis=1) ** 2))
-        slope = np.einsum("t,mtk->mk", line, part) / max(float(line @ line), EXACT)
-        change[kind] = float(np.sqrt(np.mean(slope**2)))
         near, next_ = (_structure(part, lag) for lag in (1, 2))
         fresh = min(max(2 * near - next_, 0.0), near)
         slow = max(whole - constant - fresh, 0.0)
@@ -425,7 +421,7 @@ def _remaining(draws: Float, period_s: float, shift: float) -> PoseErrors:
         else:
             constant += slow
         processes.append(Process(number, max(float(np.sqrt(constant)), EXACT)))
-    return PoseErrors((white[0], white[1]), tuple(processes), change=(change[0], change[1]))
+    return PoseErrors((white[0], white[1]), tuple(processes))
 
 
 def _structure(errors: Float, lag: int) -> float:

@@ -96,7 +96,7 @@ _PAIR_SIGMA_M = 0.012
 _MATCH_SIGMA_M = 0.03
 # Attitudes from the background err by this much at least: followed points drift alike.
 _TURN_SIGMA = np.radians(0.1)
-# Clouds that are turned or stretched lie off as if they were this far away.
+# A slow error of an attitude moves a patch as if it were this far away.
 _USUAL_RANGE_M = 10.0
 # Comparisons of one patch have errors with this correlation.
 _REPEATED = 0.5
@@ -212,8 +212,7 @@ def bind_positions(
     ]
     counts, used = np.zeros((len(pairs), 2), dtype=np.int64), np.zeros(len(pairs), dtype=np.bool_)
     most = min(_MOST_OF_PAIR, _MOST_PATCHES // max(len(pairs), 1))
-    shares = (bent * _USUAL_RANGE_M) ** 2
-    of_pair = np.array([np.sqrt(_PAIR_SIGMA_M**2 + shares[a] + shares[b]) for a, b in pairs])
+    of_pair = np.array([np.sqrt(_PAIR_SIGMA_M**2 + bent[a] ** 2 + bent[b] ** 2) for a, b in pairs])
     assumed = _assumed(cameras)
     for wider in (1.0, _GPS_LIKE) if assumed.any() else (1.0,):
         prior = np.where(assumed, wider * prior, prior)
@@ -224,20 +223,20 @@ def bind_positions(
             if not len(matches.pair):
                 used = np.zeros_like(used)
                 break
-            _, agree = _solve(matches, prior, of_pair, bent)
+            _, agree = _solve(matches, prior, of_pair)
             both = (matches.pair, matches.pair[agree])
             counts = np.stack([np.bincount(pair, minlength=len(pairs)) for pair in both], axis=1)
             used = (counts[:, 1] >= _FEWEST_PATCHES / share) & (counts[:, 1] > _AGREE * counts[:, 0])
             if not used.any():
                 break
-            solution, _ = _solve(_of_pairs(matches, used), prior, of_pair, bent)
+            solution, _ = _solve(_of_pairs(matches, used), prior, of_pair)
         if used.any():
             break
     if used.any():
         found = _of_pairs(matches, used)
         for _ in range(_LEVEL_ROUNDS):
             prior = _with_position_level(cameras, prior, solution)
-            solution, _ = _solve(found, prior, of_pair, bent)
+            solution, _ = _solve(found, prior, of_pair)
     return _bound(cameras, pairs, counts, used, prior, solution, np.minimum(prior, _prior_sigma(cameras)))
 
 
@@ -604,22 +603,27 @@ def _assumed(cameras: Sequence[Camera]) -> Bool:
 
 
 def _bent(camera: Camera) -> float:
-    """Compute by how much (rad) changing errors turn and stretch the cloud of a camera's points.
+    """Compute the standard deviation (m) of what slow errors leave in the places of a camera's points.
 
-    A position error that grows evenly over the path turns or stretches it by its size over the path's length.
+    An error that grows evenly over the path stretches the cloud: by its size over the path's length, which is
+    sqrt(12) times its standard deviation. Over a flight that is longer than an error lasts, it averages out.
     """
     if camera.static or camera.errors is None:
         return 0.0
+    span_s = float(camera.frame_t_ns[-1] - camera.frame_t_ns[0]) / 1e9
     way_m = float(np.linalg.norm(np.ptp(camera.trajectory.position, axis=0)))
-    shift_m, turn = camera.errors.change
-    return float(np.hypot(shift_m / max(way_m, EXACT), turn))
+    stretched = max(np.sqrt(12) * _USUAL_RANGE_M / max(way_m, EXACT), 1.0)
+    variance = 0.0
+    for process in camera.errors.processes:
+        if not process.constant:
+            arm_m = _USUAL_RANGE_M if process.number == ROTATION else 1.0
+            lasts = min(2 * process.correlation_s / max(span_s, EXACT), 1.0)
+            variance += lasts * (arm_m * process.sigma0) ** 2
+    return float(stretched * np.sqrt(variance))
 
 
-def _solve(matches: _Matches, prior: Float, of_pairs_m: Float, bent: Float) -> tuple[_Solution, Bool]:
-    """Solve for constant errors with a prior [6 C] and errors that pairs share; patches [P] that agree.
-
-    A path that changing errors turn, by `bent` [C] rad, turns the cloud of its points like an attitude.
-    """
+def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solution, Bool]:
+    """Solve for constant errors with a prior [6 C] and errors that pairs share; patches [P] that agree."""
     cut = matches.across
     spread = (
         cut @ (matches.covariance[matches.patch] + _MATCH_SIGMA_M**2 * np.eye(3)) @ np.swapaxes(cut, 1, 2)
@@ -629,10 +633,8 @@ def _solve(matches: _Matches, prior: Float, of_pairs_m: Float, bent: Float) -> t
     pairs = np.eye(int(matches.pair.max()) + 1)
     shared = pairs[matches.pair[matches.patch]]
     of_pair = (shared[:, None, :, None] * np.eye(3)[:, None]).reshape(len(cut), 3, -1)
-    turns = matches.design[..., len(prior) // 2 :]
-    design = cut @ np.concatenate([matches.design, turns, of_pair], axis=2)
-    others = np.concatenate([np.maximum(bent, EXACT), of_pairs_m[: len(pairs)]])
-    every = np.concatenate([prior, np.repeat(others, 3)])
+    design = cut @ np.concatenate([matches.design, of_pair], axis=2)
+    every = np.concatenate([prior, np.repeat(of_pairs_m[: len(pairs)], 3)])
     errors = np.zeros(len(every))
     seen, back_cut = np.einsum("kij,kj->ki", cut, matches.shift), np.swapaxes(cut, 1, 2)
     for k in range(_ROUNDS):

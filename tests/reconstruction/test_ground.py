@@ -167,22 +167,17 @@ def test_offsets_are_found_where_nobody_stated_the_noise() -> None:
     assert np.linalg.norm(left[0] - left[1]) < 4 * np.linalg.norm(sigma)
 
 
-def test_a_path_that_may_be_turned_shows_neither_offsets_nor_attitudes() -> None:
+def test_slow_errors_widen_what_is_left_of_an_offset() -> None:
     cameras, followed, stills = scene()
-    known = PoseErrors((1e-3, 1e-4), (Process(SHIFT_IN_WORLD, CONSTANT_M), Process(ROTATION, 0.01)))
-    change = replace(known, change=(0.04, 0.0))  # 0.01 rad over the path of 4 m
-    steady, turned = (
-        bind_positions([replace(cameras[0], errors=errors), cameras[1]], followed, stills, between=BETWEEN)
-        for errors in (known, change)
+    slow = Process(SHIFT_IN_WORLD, 0.04, correlation_s=100.0)  # all but constant over the flight
+    assert cameras[0].errors is not None
+    bent = replace(
+        cameras[0], errors=replace(cameras[0].errors, processes=(*cameras[0].errors.processes, slow))
     )
-    found = []
-    for binding in (steady, turned):
-        errors = binding.cameras[0].errors
-        assert errors is not None
-        found.append({process.number: process.sigma0 for process in errors.processes})
-    assert found[0][SHIFT_IN_WORLD] < CONSTANT_M / 3 < found[1][SHIFT_IN_WORLD]
-    # Of two equal causes, what is left of one is at least sqrt(1/2) of it.
-    assert found[0][ROTATION] < 0.005 < 0.01 * np.sqrt(0.5) <= found[1][ROTATION]
+    steady, with_slow = (
+        bind_positions([first, cameras[1]], followed, stills, between=BETWEEN) for first in (cameras[0], bent)
+    )
+    assert shift_sigma(steady.cameras[0]) < slow.sigma0 < shift_sigma(with_slow.cameras[0])
 
 
 def test_exact_camera_leaves_no_common_offset() -> None:
