@@ -484,11 +484,14 @@ class AnglesExport:
 
 def write_sto(path: Path, t_ns: Int64, value_deg: Float, sigma_deg: Float) -> str:
     """Write angles and standard deviations [T, A] deg in the order of `ANGLES`; say what is left out."""
-    kept = np.flatnonzero(np.isfinite(value_deg).any(axis=0))
-    whole: Bool = np.asarray(np.isfinite(value_deg[:, kept]).all(axis=1))
-    while len(kept) > 1 and 2 * np.count_nonzero(whole) < len(t_ns):
-        kept = np.delete(kept, np.isfinite(value_deg[:, kept]).sum(axis=0).argmin())
-        whole = np.asarray(np.isfinite(value_deg[:, kept]).all(axis=1))
+    # OpenSim stops at a gap: of the angles, from the least known on, as many go as leave most numbers.
+    there = np.isfinite(value_deg)
+    ranked = np.argsort(there.sum(axis=0), kind="stable")[np.count_nonzero(~there.any(axis=0)) :]
+    choices = [np.sort(ranked[first:]) for first in range(len(ranked))]
+    kept = max(
+        choices, key=lambda own: len(own) * np.count_nonzero(there[:, own].all(axis=1)), default=ranked
+    )
+    whole: Bool = np.asarray(there[:, kept].all(axis=1))
     value, sigma = value_deg[np.ix_(whole, kept)], sigma_deg[np.ix_(whole, kept)]
     known = np.flatnonzero(np.isfinite(sigma).all(axis=0))
     names = [list(ANGLES)[k] for k in kept]
