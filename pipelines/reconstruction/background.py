@@ -107,9 +107,9 @@ _UNKNOWN_ARM_M, _USUAL_ARM_M = 0.05, 0.03  # constant shift in the camera: a lev
 # Mounts and compasses of usual drones are off by this angle for good.
 _USUAL_TURN = float(np.radians(0.15))
 # A mount that nobody knows, or a wrong compass, may be off by this.
-_ANY_TURN = 0.5
+_ANY_TURN_RAD = 0.5
 # Satellite positions that wander by 1.5 m turn the attitudes that backgrounds show by up to 3.5 deg.
-_LEAST_ASIDE = float(np.radians(5.0))
+_LEAST_ASIDE_RAD = float(np.radians(5.0))
 # The level of the constant rotation halves its distance to the fixed point in each of these steps.
 _LEVEL_STEPS = 20
 # So many draws of the posterior are enough for its levels.
@@ -941,7 +941,9 @@ def turned_aside(camera: Camera, followed: Followed, between: Interpolation) -> 
     prior = PosePrior.of(None)
     position, _, arm = prior.constant
     at = camera.poses_at(camera.frame_t_ns[followed.rows], between)
-    found = adjust(background_of(camera, followed), *at, replace(prior, constant=(position, _ANY_TURN, arm)))
+    found = adjust(
+        background_of(camera, followed), *at, replace(prior, constant=(position, _ANY_TURN_RAD, arm))
+    )
     if found.refused is not None or found.stands:
         return None
     posed = np.isfinite(at[0][:, 0])
@@ -949,7 +951,7 @@ def turned_aside(camera: Camera, followed: Followed, between: Interpolation) -> 
     turn = rotation_vector_from_quaternion(turns).mean(axis=0)
     precision = np.linalg.inv(found.covariance[posed, 3:, 3:].mean(axis=0))
     angle, sigmas = float(np.linalg.norm(turn)), float(np.sqrt(turn @ precision @ turn))
-    return (angle, angle / sigmas) if angle > _LEAST_ASIDE and sigmas > _SIGMAS else None
+    return (angle, angle / sigmas) if angle > _LEAST_ASIDE_RAD and sigmas > _SIGMAS else None
 
 
 def clocks_of_backgrounds(

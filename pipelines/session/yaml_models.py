@@ -74,10 +74,12 @@ class YamlModel(BaseModel):
 
 
 def _by_todays_names(value: dict[object, object], known: set[str]) -> dict[object, object]:
+    """Rename keys of earlier versions; one whose new name is there already stays, and is refused."""
     found: dict[object, object] = {}
     for key, each in value.items():
         name = key if key in known else _RENAMED.get(str(key), key)
-        if key != name == "file" and name in known and isinstance(each, dict):
+        of_file = key != name == "file" and name in known
+        if of_file and isinstance(each, dict) and not each.keys() & {*value, *found}:
             found |= each  # options stood below the file's kind
         else:
             found[name if name in known and name not in {*value, *found} else key] = each

@@ -157,7 +157,7 @@ def test_opensim_reads_the_angles_of_the_session(filmed: Path, tmp_path: Path) -
     of_table = (knee["t_ns"].to_numpy() - START_NS) / 1e9
     there = np.isin(of_table.round(9), stamps.round(9))  # the others lack an angle
     knee = knee[there]
-    assert len(knee) == len(stamps) >= 0.5 * len(of_table)
+    assert len(knee) == len(stamps) > 0.8 * len(of_table)
     for name, column in (("left_knee_flexion", "value_deg"), ("left_knee_flexion_sigma", "sigma_deg")):
         values = read.getDependentColumn(name).to_numpy()
         np.testing.assert_allclose(values, knee[column], rtol=0, atol=0.51e-6)  # six decimals

@@ -264,12 +264,12 @@ def _clock_ns(text: str) -> int | None:
     match = _CLOCK.search(text)
     if match is None:
         return None
-    *whole, milliseconds, microseconds = (int(part or 0) for part in match.groups())
+    year, month, day, hour, minute, second, ms, us = (int(part or 0) for part in match.groups())
     try:
-        moment = datetime(*whole, tzinfo=UTC)  # type: ignore[misc,arg-type]  # six integers
+        moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return None
-    t_ns = since_epoch_ns(moment) + milliseconds * 1_000_000 + microseconds * 1000
+    t_ns = since_epoch_ns(moment) + ms * 1_000_000 + us * 1000
     return t_ns if abs(t_ns) < _LARGEST_NS else None
 
 

@@ -45,7 +45,7 @@ PRICE_OF_ONE = 0.8
 """Price of an alternative of one camera, of which there are as many as cameras."""
 
 LEAST_SIGMAS = 5.0
-"""What is stated is questioned beyond so many of its standard deviations: errors have heavy tails."""
+"""A stated value is doubted beyond this many of its standard deviations, because errors have heavy tails."""
 
 _FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
 _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
