@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
@@ -30,6 +34,17 @@ _DEFINITIONS = {
     OCTOMAP: {OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"}
 }
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+# The second byte of messages in CDR version 2 by table 60 of DDS-XTypes 1.3, and by its tables for DDS-RPC.
+_CDR2 = {*range(0x06, 0x0C), *range(0x10, 0x16)}
+_MUTABLE = {0x0A, 0x0B, 0x12, 0x13}
+_APPENDABLE = {0x08, 0x09, 0x14, 0x15}
+# Version 2 aligns numbers of 8 bytes to 4.
+_CDR2_ALIGNMENT = 4
+# Numbers as `struct` and NumPy name them.
+_FORMATS = {
+    "bool": "?", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,9 +66,9 @@ def ros2_name(name: str) -> str:
 def decoder(schema: Schema) -> Decoder:
     """Make the function that decodes messages of a schema; it raises ValueError for bytes that do not fit.
 
-    ros1 and cdr: dataclasses of rosbags, numeric arrays as views into the message; without a definition in
-    the file, those of ROS 1 Noetic or of the newest ROS 2. json: namespaces. protobuf: messages of that
-    library. Messages of a ROS 2 bag in compression mode `message` are decompressed.
+    ros1 and cdr (version 1 or 2): dataclasses of rosbags, numeric arrays as views into the message; without a
+    definition in the file, those of ROS 1 Noetic or of the newest ROS 2. json: namespaces. protobuf: messages
+    of that library. Messages of a ROS 2 bag in compression mode `message` are decompressed.
     """
     found = _decoder_or_reason(schema)
     if isinstance(found, str):
@@ -92,6 +107,8 @@ def _ros_decoder(schema: Schema) -> Decoder:
         if data[:4] == _ZSTD_MAGIC and schema.encoding == "cdr":
             data = _inflate_message(data)
         try:
+            if schema.encoding == "cdr" and len(data) > 1 and data[1] in _CDR2:
+                return _decode_cdr2(store, schema.type, data)
             return deserialize(data, schema.type)
         except (SerdeError, AssertionError, IndexError, OverflowError) as error:
             raise ValueError(str(error)) from error
@@ -104,6 +121,119 @@ def _inflate_message(data: memoryview | bytes) -> memoryview | bytes:
     if not complete:
         raise ValueError("the compressed message is cut off or too large")
     return content
+
+
+def _decode_cdr2(store: Typestore, type_: str, data: memoryview | bytes) -> Any:
+    """Decode a message in CDR version 2 (DDS-XTypes 1.3, section 7.4.3).
+
+    Writers differ in whether types within others, and sequences of them, have a header of their length. The
+    headers must agree with the content, so that one of the ways alone fits.
+    """
+    error = ValueError("the message does not fit its definition")
+    for nested, boxed in product((True, False), repeat=2):
+        reader = _Cdr2Reader(store, data, nested=nested, boxed=boxed)
+        try:
+            message = reader.message(type_, outermost=True)
+        except (ValueError, struct.error, KeyError) as failure:
+            error = ValueError(str(failure))
+            continue
+        if len(data) - reader.place < _CDR2_ALIGNMENT:  # padding
+            return message
+    raise error
+
+
+class _Cdr2Reader:
+    """Reader of one message; `nested` types have headers, or only the outermost, `boxed` sequences, too."""
+
+    def __init__(self, store: Typestore, data: memoryview | bytes, *, nested: bool, boxed: bool) -> None:
+        self.place = 4
+        self._store = store
+        self._data = data
+        self._order = "<" if data[1] & 1 else ">"
+        self._mutable, self._appendable = data[1] in _MUTABLE, data[1] in _APPENDABLE
+        self._nested = nested
+        self._boxed = boxed
+
+    def message(self, type_: str, *, outermost: bool = False) -> Any:
+        defined = self._store.get_msgdef(type_)
+        if not (self._nested or outermost) or not (self._mutable or self._appendable):
+            return defined.cls(*(self._value(field) for _, field in defined.fields))
+        end = self._end()
+        if self._appendable:
+            values = [self._value(field) for _, field in defined.fields]
+        else:
+            members = [self._member(defined.fields, end) for _ in defined.fields]
+            values = [value for _, value in sorted(members, key=lambda member: member[0])]
+        self._check(end)
+        return defined.cls(*values)
+
+    def _member(self, fields: Sequence[Any], end: int) -> tuple[int, Any]:
+        """Read the number and value of a member of a mutable type, whose header states its length."""
+        header = self._number("uint32")
+        number, kind = header & 0x0FFFFFFF, header >> 28 & 7
+        begin, length = self.place, 1 << kind
+        if kind >= 4:
+            length = self._number("uint32") * (1, 1, 4, 8)[kind - 4]
+            if kind == 4:
+                begin = self.place
+            else:  # that number is the first of the value, too
+                self.place, length = begin, length + 4
+        if number >= len(fields) or begin + length > end:
+            raise ValueError(f"member {number} does not fit its type")
+        value = self._value(fields[number][1])
+        self._check(begin + length)
+        return number, value
+
+    def _value(self, field: Any) -> Any:
+        from rosbags.interfaces import Nodetype
+
+        kind, about = field
+        if kind == Nodetype.NAME:
+            return self.message(about)
+        if kind == Nodetype.BASE:
+            return self._text() if about[0] == "string" else self._number(about[0])
+        (inner, what), count = about
+        is_number = inner == Nodetype.BASE and what[0] != "string"
+        end = self._end() if self._boxed and not is_number else None
+        if kind == Nodetype.SEQUENCE:
+            count = self._number("uint32")
+        if count > len(self._data):
+            raise ValueError(f"{count} values are more than the message has bytes")
+        values = (
+            self._numbers(what[0], count) if is_number else [self._value((inner, what)) for _ in range(count)]
+        )
+        if end is not None:
+            self._check(end)
+        return values
+
+    def _numbers(self, name: str, count: int) -> Any:
+        kind = np.dtype(self._order + _FORMATS[name])
+        if count:
+            size = min(kind.itemsize, _CDR2_ALIGNMENT)
+            self.place += -(self.place - 4) % size
+        begin, self.place = self.place, self.place + count * kind.itemsize
+        if self.place > len(self._data):
+            raise ValueError("the message is cut off")
+        return np.frombuffer(self._data, kind, count, begin)
+
+    def _number(self, name: str) -> Any:
+        kind = self._order + _FORMATS[name]
+        size = struct.calcsize(kind)
+        begin = self.place + -(self.place - 4) % min(size, _CDR2_ALIGNMENT)
+        self.place = begin + size
+        return struct.unpack_from(kind, self._data, begin)[0]
+
+    def _text(self) -> str:
+        content: bytes = self._numbers("uint8", self._number("uint32")).tobytes()
+        return content.rstrip(b"\0").decode()
+
+    def _end(self) -> int:
+        length = self._number("uint32")
+        return int(self.place + length)
+
+    def _check(self, end: int) -> None:
+        if self.place != end:
+            raise ValueError("a header does not agree with what it heads")
 
 
 @lru_cache(maxsize=256)

@@ -43,8 +43,6 @@ NOT_FOUND = "messages stated but not found"
 # No recorder writes larger chunks, so a larger size in a header is damage.
 CHUNK_LIMIT = 1 << 28
 RECORD_AGAIN = "no recorder writes this; copy it again from the drone"
-# The second byte of a message in CDR version 2 (DDS-XTypes 1.3, table 39), which aligns numbers otherwise.
-_CDR2 = range(6, 12)
 # The places of so many messages are Python integers at a time, which takes 10 MB.
 _BATCH = 1 << 16
 # A type takes a millisecond to understand, and PX4 has 250.
@@ -463,13 +461,6 @@ class OpenLog:
             channels = part.table.channel[batch].tolist()
             for k, data in part.read(batch):
                 decode, topic = decoders[channels[k]]
-                if topic.encoding == "cdr" and len(data) > 1 and data[1] in _CDR2:
-                    raise DataError(
-                        part.path,
-                        f"topic {topic.name}: its messages are in CDR version 2 (XCDR2), which is not read",
-                        "record or convert it with CDR version 1, as ROS 2 does by default",
-                        code="unsupported",
-                    )
                 try:
                     value = decode(data)
                 except ValueError:

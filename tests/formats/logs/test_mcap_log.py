@@ -1,7 +1,6 @@
 """MCAP in every encoding and layout: whole, without end or index, cut, damaged, and with absurd lengths."""
 
 import shutil
-import sqlite3
 from pathlib import Path
 from typing import Literal
 
@@ -10,11 +9,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from pipelines.formats.logs.message_decoders import Schema, decoder
 from pipelines.formats.logs.messages import bytes_of
 from pipelines.formats.logs.recordings import DAMAGED, TAIL, TRUNCATED, UNCLOSED
-from pipelines.session.errors import DataError
-from tests.formats.log_entries import POSE, entries, everything, everything_or_one_line, log_format, positions
-from tests.synthetic.logs import Entry, McapCompression, cut, write_log, write_mcap
+from tests.formats.log_entries import entries, everything, everything_or_one_line, log_format, positions
+from tests.synthetic.logs import Entry, McapCompression, cut, write_mcap
 
 FLIGHT = entries()
 ALL = [(e.topic, e.stamp_ns) for e in FLIGHT]
@@ -145,27 +144,25 @@ def records(content: bytes) -> dict[int, list[int]]:
     return found
 
 
-@pytest.mark.parametrize("kind", [6, 7, 9, 11])
-@pytest.mark.parametrize("container", ["mcap", "ros2-sqlite3"])
-def test_version_2_of_cdr_is_refused(tmp_path: Path, kind: int, container: str) -> None:
-    path, topic = tmp_path / "a.mcap", POSE
-    if container == "mcap":
-        with path.open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
-            channel = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channel, 1, bytes([0, kind, 0, 0, 1, 0, 0, 0, 0]), 1)
-            writer.finish()  # type: ignore[no-untyped-call]
-    else:
-        path = write_log(tmp_path, "a", "ros2-sqlite3", FLIGHT)
-        (stored,) = path.glob("*.db3")
-        database = sqlite3.connect(stored)
-        with database:
-            rows = database.execute("SELECT id, data FROM messages").fetchall()
-            changed = [(bytes([0, kind]) + data[2:], id_) for id_, data in rows]
-            database.executemany("UPDATE messages SET data = ? WHERE id = ?", changed)
-        database.close()
-    with log_format(path).open_log([path]) as log, pytest.raises(DataError) as caught:
-        list(log.messages([topic]))
-    assert caught.value.code == "unsupported"
+# A TFMessage by pycdr2 (Eclipse Cyclone): of final, appendable and mutable types.
+CDR2 = [
+    "0006000000000054000000010000000500000006000000026d00000000000002620000003ff00000000000004000000000000000"
+    "40080000000000000000000000000000000000000000000000000000000000003ff0000000000000",
+    "00090000700000006c000000010000006400000012000000080000000500000006000000020000006d0000000200000062000000"
+    "4000000018000000000000000000f03f000000000000004000000000000008402000000000000000000000000000000000000000"
+    "0000000000000000000000000000f03f",
+    "000b0000d000000000000050c800000001000000c0000000000000402e0000002a00000000000040140000001000000000000020"
+    "0500000001000020060000000100004006000000020000006d000000010000400600000002000000620000000200004070000000"
+    "6c00000000000040280000002400000000000030000000000000f03f010000300000000000000040020000300000000000000840"
+    "01000040340000003000000000000030000000000000000001000030000000000000000002000030000000000000000003000030"
+    "000000000000f03f",
+]
+
+
+@pytest.mark.parametrize("message", CDR2)
+def test_version_2_of_cdr_is_read(message: str) -> None:
+    (found,) = decoder(Schema("tf2_msgs/msg/TFMessage", "cdr"))(bytes.fromhex(message)).transforms
+    assert (found.header.stamp.sec, found.header.stamp.nanosec) == (5, 6)
+    assert (found.header.frame_id, found.child_frame_id) == ("m", "b")
+    moved, turned = found.transform.translation, found.transform.rotation
+    assert (moved.x, moved.y, moved.z, turned.x, turned.w) == (1, 2, 3, 0, 1)
