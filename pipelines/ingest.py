@@ -89,7 +89,7 @@ from pipelines.sources.pictures import open_files
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=14)
+INGEST = Stage("ingest", revision=15)
 
 
 @dataclass(frozen=True)

@@ -222,6 +222,49 @@ def steps_alike(lead_ns: Int64, gap: StampGap) -> bool:
     return float(np.abs(np.median(after) - np.median(before))) / 1e9 < abs(gap.excess_s) / 2
 
 
+def find_receipt_steps(header_ns: Int64, received_ns: Int64) -> list[tuple[int, float]]:
+    """Find steps (first message, s) of the stamps of receipt [N] while even header stamps [N] go on.
+
+    Delays scatter, so that the medians of many messages before and after tell. A queue that is emptied is no
+    step: its messages arrive at once.
+    """
+    delay_s = (received_ns - header_ns - (received_ns[0] - header_ns[0])) / 1e9
+    interval_s = np.diff(header_ns) / 1e9
+    usual_s = max(float(np.median(interval_s)), 1e-6)
+    window = max(5 * _MIN_MESSAGES, int(np.ceil(_MIN_DURATION_S / usual_s)))
+    found: list[tuple[int, float]] = []
+    if len(delay_s) < 2 * window or np.quantile(np.abs(interval_s - usual_s), _SEPARATED_SHARE) > usual_s / 4:
+        return found
+    level_s = np.median(np.lib.stride_tricks.sliding_window_view(delay_s, window), axis=1)
+    change_s = level_s[window:] - level_s[:-window]
+    # Delays behind each other in a queue correlate, which the usual change shows.
+    least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(np.abs(change_s))))
+    while len(change_s):
+        place = int(np.argmax(np.abs(change_s)))
+        sides = delay_s[place : place + window], delay_s[place + window :][:window]
+        step_s = float(change_s[place])
+        off_s = np.concatenate([side - np.median(side) for side in sides])
+        sigma_s = 1.4826 * float(np.median(np.abs(off_s))) * float(np.sqrt(np.pi / window))
+        if abs(step_s) <= max(least_s, _SIGNIFICANT_STEP_SIGMAS * sigma_s):
+            break
+        change_s[max(place - window, 0) : place + window + 1] = 0
+        # The message from which on the levels fit best.
+        around = delay_s[place : place + 2 * window]
+        misfit_s = np.cumsum(np.abs(around - np.median(sides[0])) - np.abs(around - np.median(sides[1])))
+        at = place + int(np.argmin(misfit_s)) + 1
+        received_s = received_ns[at - window // 2 : at] / 1e9, received_ns[at : at + window] / 1e9
+        wide_s = delay_s[max(at - 10 * window, 0) : at], delay_s[at : at + 10 * window]
+        lasting_s = float(np.median(wide_s[1]) - np.median(wide_s[0]))
+        if (
+            least_s < abs(lasting_s) <= MAX_STEP_S
+            and abs(lasting_s - step_s) < abs(step_s) / 2
+            and abs(interval_s[at - 1] - usual_s) < abs(step_s) / 4
+            and min(np.ptp(received_s[0]), np.ptp(received_s[1])) > usual_s * window / 4
+        ):
+            found.append((at, lasting_s))
+    return sorted(found)
+
+
 def find_gaps(stamps_ns: Int64) -> list[StampGap]:
     """Find the few gaps of an even sequence of stamps [N], which are in the order of writing."""
     interval_s = np.diff(stamps_ns) / 1e9

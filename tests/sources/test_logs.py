@@ -1,7 +1,7 @@
 """Logs of a flight: clocks that step, and camera infos that change."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from pipelines.session.recognition import recognise
 from pipelines.session.records import Trajectory
 from pipelines.session.registries import LogFormat
 from pipelines.sources.logs import FlightLogs
-from tests.synthetic.logs import Container, Entry, write_log
+from tests.synthetic.logs import Container, Entry, write_log, write_split_ros2
 
 EPOCH_NS, INTERVAL_NS, DELAY_NS, STEP_AT = 1_700_000_000_000_000_000, 50_000_000, 4_000_000, 60
 TIMES_NS = EPOCH_NS + INTERVAL_NS * np.arange(120)
@@ -88,14 +88,18 @@ def trajectory(log: Path) -> tuple[Trajectory, list[str]]:
         return logs.trajectory("a", "/pose", None, None, max_gap_ns=10**9), notes
 
 
-@pytest.mark.parametrize("container", ["ros1", "ros2-sqlite3", "mcap-cdr"])
+@pytest.mark.parametrize("container", ["ros1", "ros2-sqlite3", "mcap-cdr", "split"])
 @pytest.mark.parametrize("scatter_ns", [0, 15e6])
 @pytest.mark.parametrize("step_s", [-1.5, -0.05, 0.05, 0.3])
 def test_a_step_of_all_clocks_of_a_log_is_taken_out(
-    tmp_path: Path, step_s: float, scatter_ns: float, container: Container
+    tmp_path: Path, step_s: float, scatter_ns: float, container: Container | Literal["split"]
 ) -> None:
     stepping = entries(round(step_s * 1e9), together=True, scatter_ns=scatter_ns)
-    poses, notes = trajectory(write_log(tmp_path, "log", container, stepping))
+    if container == "split":  # where the clock steps
+        parts = stepping[: 4 * STEP_AT], stepping[4 * STEP_AT :]
+        poses, notes = trajectory(write_split_ros2(tmp_path / "log", parts))
+    else:
+        poses, notes = trajectory(write_log(tmp_path, "log", container, stepping))
     np.testing.assert_array_equal(poses.t_ns, TIMES_NS)
     np.testing.assert_allclose(poses.position[:, 0], 0.1 * np.arange(120), atol=1e-12)
     assert [f"{step_s:+.3f} s at " in note for note in notes] == [True, True]  # of the recorder, the header

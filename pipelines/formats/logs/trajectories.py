@@ -27,7 +27,15 @@ from pipelines.formats.logs.messages import (
 from pipelines.formats.logs.recordings import LogPart, OpenLog, begins_like, open_parts
 from pipelines.formats.poses import clean_poses
 from pipelines.geometry.arrays import Int64
-from pipelines.geometry.clocks import MAX_STEP_S, StampGap, find_gaps, may_step, steps_alike, time_passed
+from pipelines.geometry.clocks import (
+    MAX_STEP_S,
+    StampGap,
+    find_gaps,
+    find_receipt_steps,
+    may_step,
+    steps_alike,
+    time_passed,
+)
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.poses import Link, chain, continuous_signs, find_route, pose_covariance_in_body
 from pipelines.session.errors import DataError
@@ -323,14 +331,50 @@ def open_recording(paths: Sequence[Path], open_part: Callable[[Path], LogPart]) 
     passed. Headers show it to the ms, because receipt is delayed and headers are not.
     """
     log = OpenLog(*open_parts(paths, open_part))
-    for part in log.parts:
-        counts = {channel: len(part.rows_of([channel])) for channel in part.channels}
-        if not counts:
-            continue
-        densest = np.sort(part.rows_of([max(counts, key=lambda channel: (counts[channel], -channel))]))
-        if may_step(part.received_ns[densest]):
-            _take_out_gaps(log, part, densest)
+    for recording in _recordings(log):
+        if len(recording.densest) and may_step(recording.received_ns[recording.densest]):
+            _take_out_gaps(recording)
     return log
+
+
+class _Recording:
+    """Files of a log that follow each other; rows are numbered through, in the order of writing."""
+
+    def __init__(self, log: OpenLog, parts: Sequence[LogPart]) -> None:
+        self.log = log
+        self.parts = parts
+        self.starts = np.cumsum([0, *(len(part.received_ns) for part in parts)])
+        rows: dict[tuple[str, str, str], list[Int64]] = {}
+        for part, start in zip(parts, self.starts.tolist(), strict=False):
+            for number, channel in part.channels.items():
+                rows.setdefault(channel.key, []).append(part.rows_of([number]) + start)
+        every = [np.sort(np.concatenate(own)) for own in rows.values()]
+        self.densest: Int64 = max(every, key=len, default=np.zeros(0, np.int64))
+
+    @property
+    def received_ns(self) -> Int64:
+        """Stamps of receipt, as far as they are mended."""
+        return np.concatenate([part.received_ns for part in self.parts])
+
+    def take_out(self, row: int, step_ns: int) -> None:
+        """Take a step of the clock out, from a row on."""
+        place = int(np.searchsorted(self.starts, row, side="right")) - 1
+        self.log.take_out(self.parts[place], row - int(self.starts[place]), step_ns)
+
+
+def _recordings(log: OpenLog) -> list[_Recording]:
+    """Join the files that begin where the file before them ends, as far as a clock steps."""
+    joined: list[list[LogPart]] = []
+    for part in log.parts:
+        if not len(part.received_ns):
+            continue
+        last = joined[-1][-1] if joined else part
+        pause_s = abs(int(part.received_ns[0] - last.received_ns[-1])) / 1e9
+        if joined and pause_s < MAX_STEP_S + _NOTED_GAP_S:
+            joined[-1].append(part)
+        else:
+            joined.append([part])
+    return [_Recording(log, parts) for parts in joined]
 
 
 @dataclass(frozen=True)
@@ -357,53 +401,66 @@ class LogFile:
         return open_recording(paths, self.open_part)
 
 
-def _take_out_gaps(log: OpenLog, part: LogPart, densest: Int64) -> None:
-    """Take steps of the clock out of a part; `densest` are the rows of its densest topic."""
-    bodies = _written_bodies(log, part)
-    header_gaps: list[tuple[Int64, StampGap]] = []
+def _take_out_gaps(recording: _Recording) -> None:
+    """Take steps of the clock out of a recording."""
+    bodies = _written_bodies(recording)
+    received_ns, header_gaps = recording.received_ns, []
     if bodies and (header_ns := bodies[0].header_ns).all():
         rows = bodies[0].receive_ns
-        lead_ns = header_ns - part.received_ns[rows]
+        lead_ns = header_ns - received_ns[rows]
         header_gaps = [(rows, gap) for gap in find_gaps(header_ns) if steps_alike(lead_ns, gap)]
-    for rows, gap in header_gaps or [(densest, gap) for gap in find_gaps(part.received_ns[densest])]:
-        _take_out_gap(log, part, rows, gap, bodies)
+    densest = recording.densest
+    for rows, gap in header_gaps or [(densest, gap) for gap in find_gaps(received_ns[densest])]:
+        _take_out_gap(recording, rows, gap, bodies)
+    if bodies and bodies[0].header_ns.all():
+        rows = bodies[0].receive_ns
+        for index, step_s in find_receipt_steps(bodies[0].header_ns, recording.received_ns[rows]):
+            recording.take_out(int(rows[index]), round(step_s * 1e9))
+            after_s = float(received_ns[rows[index - 1]] - received_ns[0]) / 1e9
+            recording.log.notes.append(
+                f"the stamps of receipt step by {step_s:+.3f} s at {after_s:.2f} s against those of headers;"
+                " taken out"
+            )
 
 
-def _written_bodies(log: OpenLog, part: LogPart) -> list[LoggedRows]:
+def _written_bodies(recording: _Recording) -> list[LoggedRows]:
     """Return a topic's bodies with most poses, densest first, as written; rows' numbers stand for stamps."""
+    log = recording.log
     topics = [topic for topic in log.topics if kind_of(topic) in {"poses", "transforms"} and topic.count]
     if not topics:
         return []
     name = max(topics, key=lambda topic: topic.count).name
-    received_ns, part.received_ns = part.received_ns, np.arange(len(part.received_ns))
     bodies: dict[Edge, Samples] = {}
-    try:
-        for sample in all_samples(log.messages_of(part, [name]), "log"):
-            if isinstance(sample, PoseSample):
-                bodies.setdefault((sample.target, sample.source), Samples()).add_pose(sample)
-    finally:
-        part.received_ns = received_ns
-        log.forget()
+    for part, start in zip(recording.parts, recording.starts.tolist(), strict=False):
+        received_ns, part.received_ns = part.received_ns, start + np.arange(len(part.received_ns))
+        try:
+            for sample in all_samples(log.messages_of(part, [name]), "log"):
+                if isinstance(sample, PoseSample):
+                    bodies.setdefault((sample.target, sample.source), Samples()).add_pose(sample)
+        finally:
+            part.received_ns = received_ns
+            log.forget()
     return sorted((body.rows(7) for body in bodies.values()), key=lambda body: -len(body.values))
 
 
-def _take_out_gap(log: OpenLog, part: LogPart, rows: Int64, gap: StampGap, bodies: list[LoggedRows]) -> None:
-    """Take out a step of the clock that is the gap between two rows of a part; note it."""
+def _take_out_gap(recording: _Recording, rows: Int64, gap: StampGap, bodies: list[LoggedRows]) -> None:
+    """Take out a step of the clock that is the gap between two rows; note it."""
+    log, received_ns = recording.log, recording.received_ns
     before, last = rows[[max(gap.index - _IN_FLIGHT, 0), gap.index]].tolist()
-    leaps_s = np.diff(part.received_ns[before : last + 1]) / 1e9
+    leaps_s = np.diff(received_ns[before : last + 1]) / 1e9
     row = last - int(np.argmax(leaps_s[::-1] * np.sign(gap.excess_s)))  # the last one of equal leaps
-    uneven_s = float(np.quantile(np.abs(np.diff(part.received_ns[rows]) / 1e9 - gap.usual_s), 0.9))
+    uneven_s = float(np.quantile(np.abs(np.diff(received_ns[rows]) / 1e9 - gap.usual_s), 0.9))
     if (
         abs(leaps_s[row - before - 1] - gap.excess_s)
         > max(1.5 * gap.usual_s, abs(gap.excess_s) / 4) + uneven_s
     ):
         return  # other messages were received in the gap
     started_ns = min(int(each.received_ns.min()) for each in log.parts if len(each.received_ns))
-    after_s = (int(part.received_ns[rows[gap.index - 1]]) - started_ns) / 1e9
+    after_s = (int(received_ns[rows[gap.index - 1]]) - started_ns) / 1e9
     told = f"all stamps step by {gap.excess_s:+.3f} s at {after_s:.2f} s"
-    stepped = True if gap.goes_back else _clock_stepped(part, bodies, gap, last)
+    stepped = True if gap.goes_back else _clock_stepped(received_ns, bodies, gap, last)
     if stepped and abs(gap.excess_s) <= MAX_STEP_S:
-        log.take_out(part, row, round(gap.excess_s * 1e9))
+        recording.take_out(row, round(gap.excess_s * 1e9))
         log.notes.append(f"{told}: the recorder's clock was set; taken out")
     elif stepped or (stepped is None and abs(gap.excess_s) >= _NOTED_GAP_S):
         log.notes.append(
@@ -411,14 +468,14 @@ def _take_out_gap(log: OpenLog, part: LogPart, rows: Int64, gap: StampGap, bodie
         )
 
 
-def _clock_stepped(part: LogPart, bodies: list[LoggedRows], gap: StampGap, row: int) -> bool | None:
-    """Test by all bodies of a part if a clock was set in a gap that ends at a row; None if none tells."""
+def _clock_stepped(received_ns: Int64, bodies: list[LoggedRows], gap: StampGap, row: int) -> bool | None:
+    """Test by all bodies if a clock was set in a gap that ends at a row; None if none tells."""
     found: set[bool] = set()
     for body in bodies:
         at = int(np.searchsorted(body.receive_ns, row))
         if not 0 < at < len(body.receive_ns):
             continue
-        t_ns = body.header_ns if body.header_ns.all() else part.received_ns[body.receive_ns]
+        t_ns = body.header_ns if body.header_ns.all() else received_ns[body.receive_ns]
         if abs(int(t_ns[at] - t_ns[at - 1]) / 1e9 - gap.usual_s - gap.excess_s) > abs(gap.excess_s) / 4:
             return False  # the headers have a clock of their own
         for values in (body.values[:, :3], continuous_signs(body.values[:, 3:])):
