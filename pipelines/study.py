@@ -12,9 +12,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
@@ -29,7 +30,7 @@ from pipelines.planning.comparison import (
     mean_of_trials,
     worth_flying,
 )
-from pipelines.planning.config import MOST_DRONES, SETTINGS, PlannerConfig, planner_config
+from pipelines.planning.config import MOST_DRONES, PlannerConfig, planner_config
 from pipelines.planning.scene import (
     LoggedFlight,
     OtherWalk,
@@ -69,27 +70,28 @@ from pipelines.session.storage import (
     whole_folder,
     write_json,
 )
-from pipelines.session.yaml_files import plain_yaml
+from pipelines.session.yaml_files import checked, plain_yaml
+from pipelines.session.yaml_models import YamlModel
 from pipelines.simulate import recorded_motions
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import build_set
 from pipelines.simulation.scenario import read_scenario
 from pipelines.simulation.walks import (
+    CODES,
     IMITATED,
-    StudiedNoise,
+    LEVELS,
     StudyMethod,
+    Variables,
     Walk,
     WalkStudy,
     exact_keypoints,
     formation,
     model_keypoints,
-    numbers,
-    single,
     triangulate_robustly,
+    varied_most,
     views_of,
     walk,
     walk_of,
-    walk_study,
 )
 
 # It is raised whenever the same study gives other figures than before.
@@ -105,7 +107,6 @@ _MEASURED = (
 )
 """Figures of a combination, in the rows of a study of a session."""
 _UNDIVIDED = ("config",)  # variables whose value may hold commas
-_OF_SESSION = ("arm", "robots", "range_m", "tilt_deg", "actor", "config", "trials", "seed", "pose_noise")
 # People walk up to a third slower or faster than usual, stand a while, and turn where they please.
 _SPEEDS, _MOST_DELAY_S, _MOST_TURN_DEG = (0.7, 1.4), 3.0, 60.0
 # A way that is turned into obstacles so often is not turned at all.
@@ -214,23 +215,13 @@ def _stored(
 # --- a walk --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Condition:
-    """One condition of a study of a walk."""
+class _Condition(NamedTuple):
+    """One condition of a study of a walk: columns of its rows."""
 
     tilt_deg: float
     robots: int
-    noise: StudiedNoise
-
-    def row(self) -> Row:
-        """Return its columns."""
-        model = self.noise.model
-        return {
-            "tilt_deg": self.tilt_deg,
-            "robots": self.robots,
-            "noise": self.noise.label,
-            "noise_model": model,
-        }
+    noise: str
+    noise_model: str
 
 
 def _study_walk(
@@ -239,8 +230,10 @@ def _study_walk(
     scenario = None if place is None else read_scenario(place)
     if scenario is not None and "seconds" not in stated:
         stated = {**stated, "seconds": (f"{scenario.duration_s:g}",)}
-    settings = walk_study(stated)
-    ingredients: dict[str, object] = {"settings": asdict(settings)}
+    settings, axis = checked(WalkStudy, stated, "study", CODES), varied_most(stated)
+    noise = {label: LEVELS.get(label, label) for label in settings.noise}
+    shown = {"axis": axis, **settings.model_dump(), "noise": noise}
+    ingredients: dict[str, object] = {"settings": shown}
     motions = {}
     if scenario is not None and place is not None:
         motions = recorded_motions(scenario, place)
@@ -259,9 +252,9 @@ def _study_walk(
             performer = build_set(scenario, bvh=motions).people[0]
             filmed = walk_of(performer, scenario, settings.seconds, settings.rate_hz)
         conditions = [
-            _Condition(*each)
-            for noise in settings.noise
-            for each in product(settings.tilts_deg, settings.robots, [noise])
+            _Condition(*each, *of)
+            for of in noise.items()
+            for each in product(settings.tilts_deg, settings.robots)
         ]
         progress.start("Measuring", len(conditions) * settings.trials)
         halt = Halt()
@@ -271,17 +264,16 @@ def _study_walk(
         ]
         parts = side_by_side(lambda each: making.part(*each), work, workers=workers, halt=halt)
         rows = [row for part in parts for row in read_json(part / "rows.json")["rows"]]
-        cells = estimates(rows, settings.axis)
+        cells = estimates(rows, axis)
         if not any(cell["metrics"]["mpjpe_mm"] for cell in cells):
             problem = "nothing was reconstructed by all methods"
             raise DataError("study", problem, "film longer, or at lower tilts", code="nothing-reconstructed")
-        noise = {each.label: each.model for each in settings.noise}
         metrics = {
             "kind": "walk",
-            "axis": settings.axis,
+            "axis": axis,
             "scenario": None if scenario is None else scenario.name,
             "keypoints": keypoints,
-            "settings": {**asdict(settings), "noise": noise},
+            "settings": shown,
             "cells": cells,
         }
         return metrics, rows
@@ -294,7 +286,7 @@ def _measure_condition(
 ) -> None:
     cameras = formation(filmed, cameras=condition.robots, tilt_deg=condition.tilt_deg)
     exact = exact_keypoints(filmed, cameras)
-    models = condition.noise.models()
+    models = settings.models(condition.noise)
     rows: list[Row] = []
     for trial in range(settings.trials):
         halt.check()
@@ -308,7 +300,7 @@ def _measure_condition(
             fell_back[method] = float(doubt is not None)
         for method, errors in _compared(points, filmed).items():
             own = {"trial": trial, "method": method, **errors, "fell_back": fell_back[method]}
-            rows.append({**condition.row(), **own})
+            rows.append({**condition._asdict(), **own})
         progress.advance()
     write_json(folder / "rows.json", {"rows": rows})
 
@@ -350,8 +342,7 @@ def _compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMe
 
 
 def _study_session(stated: Stated, place: Path, store: Store, progress: Progress) -> Studied:
-    settings = _replay_settings(stated)
-    varied = {name: values for name, values in stated.items() if name in _varied(stated)}
+    settings, varied = _replay_settings(stated)
     with locked(place) as session:
         description, reconstructed, inputs = inputs_of(session)
         cells = list(_cells(varied))
@@ -370,7 +361,7 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
             maps = sorted(load_maps(place), key=lambda one: one.from_ns) if description.map else []
             scenes: dict[str, ReplayScene] = {}
             progress.start("Replaying", len(cells))
-            walks = _walks(stated, flight, maps)
+            walks = _walks(stated, flight, maps, settings.seed)
             rows, capped, places = [], [], []
             for k, cell in enumerate(cells):
                 own = replace(settings, planner=_planner_of(settings.planner, cell))
@@ -420,13 +411,14 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
         return store(ingredients, produce)
 
 
-def _walks(stated: Stated, flight: LoggedFlight, maps: Sequence[Occupancy]) -> dict[str, LoggedFlight]:
+def _walks(
+    stated: Stated, flight: LoggedFlight, maps: Sequence[Occupancy], seed: int
+) -> dict[str, LoggedFlight]:
     """Return the flights of the walks that `actor` asks for: a number of them, or one for each value."""
     texts = stated.get("actor", ())
     if len(texts) != 1 or not texts[0].isdigit():
         return {text: walked_otherwise(flight, _walk_of(text), maps) for text in texts}
     walks = {_walk_name(0): flight}
-    seed = single(stated, "seed", int, 0, 2**32 - 1, 0)
     for k in range(1, len(_walk_names(texts))):
         rng = np.random.default_rng([seed, k])
         for tries in range(_MOST_TRIES):
@@ -450,26 +442,27 @@ def _walk_name(number: int) -> str:
 def _walk_names(texts: Sequence[str]) -> Sequence[str]:
     """Return the names of the walks that `actor` asks for."""
     if len(texts) == 1 and texts[0].isdigit():
-        (number,) = numbers({"actor": texts}, "actor", int, 1, _MAX_CELLS)
+        if not 1 <= (number := int(texts[0])) <= _MAX_CELLS:
+            problem = f"is not between 1 and {_MAX_CELLS}"
+            raise DataError(f"actor={texts[0]}", problem, "change it", code="bad-value")
         return [_walk_name(k) for k in range(number)]
     for text in texts:
         _walk_of(text)
     return texts
 
 
+class _WalkWords(YamlModel):
+    """Variations of a walk, as users write them."""
+
+    speed: float = Field(1.0, ge=0.2, le=5.0)
+    delay: float = Field(0.0, ge=0.0, le=60.0)
+    turn: float = Field(0.0, ge=-180.0, le=180.0)
+
+
 def _walk_of(text: str) -> OtherWalk:
     """Read a walk like `speed:0.8+delay:2+turn:30`; `logged` is the walk of the log."""
-    limits = {"speed": (0.2, 5.0), "delay": (0.0, 60.0), "turn": (-180.0, 180.0)}
-    found = {}
-    for part in text.split("+") if text != "logged" else ():
-        name, _, value = part.partition(":")
-        if name not in limits:
-            remedy = "write a number of walks, or logged, speed:0.8, delay:2, turn:-30, joined by +"
-            raise DataError(
-                f"actor={text}", f"{part!r} is no variation of a walk", remedy, code="no-such-name"
-            )
-        (found[name],) = numbers({name: [value]}, name, float, *limits[name])
-    return OtherWalk(found.get("speed", 1.0), found.get("delay", 0.0), found.get("turn", 0.0))
+    words = dict(part.partition(":")[::2] for part in text.split("+")) if text != "logged" else {}
+    return OtherWalk(*checked(_WalkWords, words, f"actor={text}", CODES).model_dump().values())
 
 
 def _doubts(scenes: Mapping[str, ReplayScene], maps: Sequence[Occupancy]) -> list[str]:
@@ -522,31 +515,38 @@ def _no_skeleton(place: Path) -> DataError:
     )
 
 
-def _varied(stated: Stated) -> list[str]:
-    """List the variables of a cell: the arm, the planner settings, and how many drones fly."""
-    return [name for name in stated if name not in ("config", "trials", "seed", "pose_noise")]
+class _SessionStudy(Variables):
+    """Variables of a study of a session besides the settings of the planner, which stay texts."""
+
+    model_config = ConfigDict(extra="allow")
+
+    arm: tuple[str, ...] = ("adaptive",)
+    robots: tuple[Annotated[int, Field(ge=2, le=MOST_DRONES)], ...] = ()
+    range_m: tuple[Annotated[float, Field(ge=0.5, le=500)], ...] = ()
+    tilt_deg: tuple[Annotated[float, Field(ge=-10, le=85)], ...] = ()
+    actor: tuple[str, ...] = ()
+    config: tuple[str, ...] = ()
+    trials: int = Field(ReplanSettings().trials, ge=1, le=10_000)
+    seed: int = Field(0, ge=0, lt=2**32)
+    pose_noise: tuple[str, ...] = ()
 
 
-def _replay_settings(stated: Stated) -> ReplanSettings:
-    names = set(SETTINGS) - {"radius_m"}
-    unknown = [name for name in stated if name.split(".")[0] not in {*_OF_SESSION, *names}]
-    if unknown:
-        remedy = f"there are {', '.join(_OF_SESSION)}, and the settings of the planner"
-        raise DataError(unknown[0], "is no variable of a study of a session", remedy, code="no-such-name")
-    refuse_unknown(stated.get("arm", ()), logged=False)
-    numbers(stated, "range_m", float, 0.5, 500)
-    numbers(stated, "tilt_deg", float, -10, 85)
-    numbers(stated, "robots", int, 2, MOST_DRONES)
+def _replay_settings(stated: Stated) -> tuple[ReplanSettings, Stated]:
+    """Return the settings that all cells share, and the variables of the cells with their values."""
+    given = checked(_SessionStudy, stated, "study", CODES)
+    refuse_unknown(given.arm, logged=False)
     settings = settings_of(
-        stated.get("config", ()),
+        given.config,
         arms=None,
-        trials=single(stated, "trials", int, 1, 10_000, ReplanSettings().trials),
-        seed=single(stated, "seed", int, 0, 2**32 - 1, 0),
-        pose_noise=" + ".join(stated["pose_noise"]) if "pose_noise" in stated else None,
+        trials=given.trials,
+        seed=given.seed,
+        pose_noise=" + ".join(given.pose_noise) or None,
     )
-    for cell in _cells({name: values for name, values in stated.items() if name in _varied(stated)}):
+    shared = ("config", "trials", "seed", "pose_noise")
+    varied = {name: values for name, values in stated.items() if name not in shared}
+    for cell in _cells(varied):
         _planner_of(settings.planner, cell)
-    return settings
+    return settings, varied
 
 
 def _cells(varied: Stated) -> Iterator[dict[str, Any]]:
@@ -599,7 +599,7 @@ def _figures(
         "range_m": scene.config.radius_m,
         "tilt_deg": scene.config.tilt_deg,
         "robots": scene.drones,
-        **{name: value for name, value in cell.items() if name not in _OF_SESSION},
+        **{name: value for name, value in cell.items() if name not in _SessionStudy.model_fields},
         "best": False,
         "tradeoff": False,
         "capped_mm": None if estimate is None else estimate["mean"],

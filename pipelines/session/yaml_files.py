@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
@@ -26,11 +27,22 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
     if isinstance(raw.get("schema"), int) and raw["schema"] > newest:
         problem = f"has schema {raw['schema']}, newer than {newest}"
         raise DataError(path, problem, "use a newer version of mocap", code="newer-schema")
+    return checked(model, raw, path)
+
+
+def checked(
+    model: type[M],
+    values: Mapping[str, object],
+    source: Path | str,
+    codes: Mapping[str, str] = MappingProxyType({}),
+) -> M:
+    """Validate values; one DataError holds every problem, with the code of the first one's kind."""
     try:
-        return model.model_validate(raw)
+        return model.model_validate(values)
     except ValidationError as error:
         problems = [describe_problem(problem, model) for problem in error.errors()]
-        raise DataError(path, "; ".join(dict.fromkeys(problems)), code="bad-value") from None
+        code = codes.get(error.errors()[0]["type"], "bad-value")
+        raise DataError(source, "; ".join(dict.fromkeys(problems)), code=code) from None
 
 
 # No file name holds these, and UTF-8 no lone surrogate.

@@ -7,11 +7,15 @@ numbers in every formation and for every size of the errors, so that differences
 `film` measures the arms of a comparison in the same way.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
 from pipelines.geometry.cameras import undistort
@@ -27,7 +31,7 @@ from pipelines.geometry.triangulation import (
     triangulate_pictures,
 )
 from pipelines.session.camera_poses import parsed_noise_models
-from pipelines.session.errors import DataError
+from pipelines.session.yaml_models import YamlModel
 from pipelines.simulation.body import PosablePerson, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flight import Performer
@@ -52,7 +56,6 @@ _SPEED_MPS = 1.2
 # The person starts from a stand, and filming begins when it has become a walk.
 _UNDER_WAY_S = 2.0
 _AIM_S, _AIM_STEP_S = 1.0, 0.05  # cameras follow the mean over a stride, not every bob of the hip
-T = TypeVar("T", int, float)
 # One random stream for each.
 _POSES, _KEYPOINTS = range(2)
 
@@ -267,162 +270,80 @@ StudyMethod = Method | Literal["auto"]
 METHODS: tuple[StudyMethod, ...] = (*get_args(Method), "auto")
 """Methods that a study compares, in the order of its tables."""
 
-LEVELS = {"none": (0.0, 0.0), "low": (0.1, 0.5), "medium": (0.3, 1.0), "high": (0.5, 2.0)}
-"""Pose noise per axis, m and degrees."""
-
-# Levels of the noise in Ho et al., Sim E1 and E2, in which `auto` may be left out for speed.
-_USUAL = {"method": METHODS, "keypoints": ("model",), "seconds": ("75",), "trials": ("10",), "seed": ("0",)}
-KNOWN = ("tilt_deg", "robots", "noise", "method", "keypoints", "seconds", "rate_hz", "trials", "seed")
-"""Variables of a study of a walk."""
+LEVELS = {
+    "none": "",
+    "low": "white:position_m=0.1,rotation_deg=0.5",
+    "medium": "white:position_m=0.3,rotation_deg=1",
+    "high": "white:position_m=0.5,rotation_deg=2",
+}
+"""Pose noise per axis, by name; empty for exact poses."""
 
 # The refinement falls back to `robust` with fewer pictures, so that its row would be that of `robust`.
 _MIN_TIMES_FOR_AUTO = 20
 
-
-@dataclass(frozen=True)
-class StudiedNoise:
-    """Errors of the logged poses."""
-
-    label: str
-    model: str  # as users write it; empty for exact poses
-
-    def models(self) -> list[NoiseModel]:
-        """Parse the noise models; DataError: the text is not a noise model, or a name is unknown."""
-        return parsed_noise_models("noise", self.model) if self.model else []
+CODES = {"literal_error": "no-such-name", "extra_forbidden": "no-such-name", "twice": "stated-twice"}
+"""Codes of the problems that pydantic finds in the variables of a study."""
 
 
-@dataclass(frozen=True)
-class WalkStudy:
-    """Settings of a study of a walk, checked by `walk_study`."""
+class Variables(YamlModel):
+    """Variables of a study; each has a tuple of texts, of which only one where one value is expected."""
 
-    axis: Axis  # that a figure has along its horizontal axis, and that the ratio compares
-    tilts_deg: tuple[float, ...]
-    robots: tuple[int, ...]
-    noise: tuple[StudiedNoise, ...]
-    methods: tuple[StudyMethod, ...]
-    keypoints: Literal["model", "exact"]
-    seconds: float
-    rate_hz: float
-    trials: int
-    seed: int
+    @field_validator("*", mode="before")
+    @classmethod
+    def _one_or_several(cls, texts: object, info: ValidationInfo) -> object:
+        one = get_origin(cls.model_fields[info.field_name or ""].annotation) is not tuple
+        if one and isinstance(texts, Sequence) and len(texts) != 1:
+            raise ValueError("takes one value")
+        return texts[0] if one and isinstance(texts, Sequence) else texts
+
+    @field_validator("*")
+    @classmethod
+    def _each_once(cls, values: object) -> object:
+        if isinstance(values, tuple) and len(set(values)) < len(values):
+            raise PydanticCustomError("twice", "states a value twice")
+        return values
 
 
-def walk_study(stated: Mapping[str, Sequence[str]]) -> WalkStudy:
-    """Return the settings of a study; what is not stated is as in the experiments of Ho et al.
+class WalkStudy(Variables):
+    """Settings of a study of a walk; what is not stated is as in the experiments of Ho et al.
 
-    `noise` has names of `LEVELS` (white noise), or models as `--pose-noise` has them. DataError: an unknown
-    name of a variable (`KNOWN`), a value given twice, or a number out of range.
+    `noise` has names of `LEVELS` (white noise), or models as `--pose-noise` has them.
     """
-    values = {**_USUAL, "rate_hz": (), **stated}
-    unknown = [name for name in values if name not in KNOWN]
-    if unknown:
-        raise DataError(unknown[0], "is no variable of a study of a walk", f"there are {', '.join(KNOWN)}",
-                        code="no-such-name")  # fmt: skip
-    (keypoints,) = _choices(values, "keypoints", ("model", "exact"))
-    seconds, rate_hz = (
-        single(values, name, float, 0.1, most, default)
-        for name, most, default in (("seconds", 600, 75), ("rate_hz", 240, 30.0))
-    )
-    methods = _choices(values, "method", METHODS)
-    needed = _MIN_TIMES_FOR_AUTO if "auto" in methods else 2
-    if seconds * rate_hz < needed:
-        raise DataError(
-            "seconds",
-            f"{seconds:g} s at {rate_hz:g} Hz are less than {needed} pictures"
-            + (", too few for auto" if needed > 2 else ""),
-            "film longer" + (", or leave auto out of method" if needed > 2 else ""),
-            code="bad-value",
-        )
-    axis = _axis(stated)
-    noise = [
-        StudiedNoise(text, _white(text) if text in LEVELS else text) for text in values.get("noise", LEVELS)
-    ]
-    _refuse_twice("noise", [each.label for each in noise])
-    for each in noise:
-        each.models()
-    return WalkStudy(
-        axis,
-        tuple(map(float, numbers(values, "tilt_deg", float, -10, 85, ("15",)))),
-        tuple(numbers(values, "robots", int, 2, 8, ("2",))),
-        tuple(noise),
-        tuple(name for name in METHODS if name in methods),
-        "exact" if keypoints == "exact" else "model",
-        seconds,
-        rate_hz,
-        single(values, "trials", int, 1, 10_000, 10),
-        single(values, "seed", int, 0, 2**32 - 1, 0),
-    )
+
+    tilts_deg: tuple[Annotated[float, Field(ge=-10, le=85)], ...] = Field((15.0,), alias="tilt_deg")
+    robots: tuple[Annotated[int, Field(ge=2, le=8)], ...] = (2,)
+    noise: tuple[str, ...] = tuple(LEVELS)
+    methods: tuple[StudyMethod, ...] = Field(METHODS, alias="method")
+    keypoints: Literal["model", "exact"] = "model"
+    seconds: float = Field(75.0, ge=0.1, le=600)
+    rate_hz: float = Field(30.0, ge=0.1, le=240)
+    trials: int = Field(10, ge=1, le=10_000)
+    seed: int = Field(0, ge=0, lt=2**32)
+
+    @model_validator(mode="after")
+    def _enough_pictures(self) -> WalkStudy:
+        for noise in self.noise:
+            self.models(noise)
+        needed = _MIN_TIMES_FOR_AUTO if "auto" in self.methods else 2
+        if self.seconds * self.rate_hz < needed:
+            raise ValueError(
+                f"seconds: {self.seconds:g} s at {self.rate_hz:g} Hz are less than {needed} pictures: film"
+                " longer, or leave auto out of method"
+            )
+        return self
+
+    def models(self, noise: str) -> list[NoiseModel]:
+        """Build the models of one of the kinds of noise; DataError: it is neither a name nor a model."""
+        text = LEVELS.get(noise, noise)
+        return parsed_noise_models("noise", text) if text else []
 
 
-def _axis(stated: Mapping[str, Sequence[str]]) -> Axis:
+def varied_most(stated: Mapping[str, Sequence[str]]) -> Axis:
     """Choose the first number that varies; without one the noise if it was stated, else the tilt."""
-    order: tuple[Axis, ...] = ("tilt_deg", "robots")
-    varied = [name for name in stated if name in order and len(stated[name]) > 1]
-    if varied:
-        return "tilt_deg" if varied[0] == "tilt_deg" else "robots"
+    axes: tuple[Axis, ...] = ("tilt_deg", "robots")
+    for name in (name for text in stated for name in axes if name == text):
+        if len(stated[name]) > 1:
+            return name
     if "noise" in stated:
         return "noise"
     return "robots" if "robots" in stated and "tilt_deg" not in stated else "tilt_deg"
-
-
-def _white(level: str) -> str:
-    position_m, rotation_deg = LEVELS[level]
-    return f"white:position_m={position_m:g},rotation_deg={rotation_deg:g}" if position_m else ""
-
-
-# --- values --------------------------------------------------------------------------------------------
-
-
-def numbers(
-    values: Mapping[str, Sequence[str]],
-    name: str,
-    number: Callable[[str], Any],
-    least: float,
-    most: float,
-    default: Sequence[str] = (),
-) -> list[Any]:
-    """Read the numbers of a variable; DataError: one is no number, out of range (NaN, too), or twice."""
-    texts = values.get(name) or default
-    try:
-        found = [number(text) for text in texts]
-    except ValueError:
-        raise DataError(
-            f"{name}={','.join(texts)}", "is no list of numbers", "write 2,3,4 or 0:60:15", code="bad-value"
-        ) from None
-    for value in found:
-        if not least <= value <= most:
-            raise DataError(
-                f"{name}={value:g}", f"is not between {least:g} and {most:g}", "change it", code="bad-value"
-            )
-    _refuse_twice(name, found)
-    return found
-
-
-def single(
-    values: Mapping[str, Sequence[str]],
-    name: str,
-    number: Callable[[str], T],
-    least: float,
-    most: float,
-    default: float,
-) -> T:
-    """Read the number of a variable that takes one value; DataError as for `numbers`."""
-    found: list[T] = numbers(values, name, number, least, most, (f"{default:g}",))
-    if len(found) > 1:
-        raise DataError(name, "takes one value", "leave the others out", code="bad-value")
-    return found[0]
-
-
-def _choices(values: Mapping[str, Sequence[str]], name: str, known: Sequence[str]) -> Sequence[str]:
-    given = values[name]
-    unknown = [text for text in given if text not in known]
-    if unknown or not given or (name == "keypoints" and len(given) > 1):
-        problem = f"no such name: {', '.join(unknown)}" if unknown else "takes one value"
-        raise DataError(name, problem, f"there are {', '.join(known)}", code="no-such-name")
-    _refuse_twice(name, given)
-    return given
-
-
-def _refuse_twice(name: str, given: Sequence[object]) -> None:
-    if len(set(given)) < len(given):
-        raise DataError(name, "states a value twice", "name each once", code="stated-twice")
