@@ -78,12 +78,16 @@ def _by_todays_names(value: dict[object, object], known: set[str]) -> dict[objec
     found: dict[object, object] = {}
     for key, each in value.items():
         name = key if key in known else _RENAMED.get(str(key), key)
-        of_file = key != name == "file" and name in known
-        if of_file and isinstance(each, dict) and not each.keys() & {*value, *found}:
-            found |= each  # options stood below the file's kind
+        was_nested = key != name and name in known and (name == "file" or _is_part(each, known))
+        if was_nested and isinstance(each, dict) and not each.keys() & {*value, *found}:
+            found |= each  # options stood below the file's kind, and angles below `fixed`
         else:
             found[name if name in known and name not in {*value, *found} else key] = each
     return found if found == value else _by_todays_names(found, known)
+
+
+def _is_part(value: object, known: set[str]) -> bool:
+    return isinstance(value, dict) and value.keys() <= known
 
 
 def _holds_truth_value(value: object) -> bool:

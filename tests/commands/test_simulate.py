@@ -290,7 +290,7 @@ HOSTILE = {
     "a wood too dense": ("walls:", "wood: {count: 2000, radius_m: 3}\n  walls:", "wood"),
     "more offsets than drones": ("[0, 0.12]", "[0, 0.12, 0.3]", "clock_offsets_s"),
     "nobody": ("actor: {motion: [walk: {distance_m: 5}]}\n", "", "actors"),
-    "newer schema": ("schema: 1", "schema: 2", "schema"),
+    "newer schema": ("schema: 1", "schema: 3", "schema"),
     "an exposure longer than a picture": ("rate_hz: 30", "rate_hz: 30, exposure_ms: 34", "exposure_ms"),
     "a lens that misses the corners": (
         "rate_hz: 30",

@@ -97,7 +97,7 @@ def test_auto_halves_white_errors_where_all_methods_have_a_point(tmp_path: Path)
     words = [
         "robots=3",
         f"noise={noise}",
-        "seconds=4",
+        *SMALL[:1],
         "rate_hz=15",
         "trials=1",
         "method=midpoint,robust,auto",

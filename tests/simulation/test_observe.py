@@ -66,6 +66,16 @@ STANDING: dict[str, Any] = {"motion": [{"stand": {"seconds": 1}}]}
 WALKING: dict[str, Any] = {"motion": [{"walk": {"distance_m": 6}}]}
 
 
+def test_schema_2_films_as_drones_do() -> None:
+    """Expect a readout as long as a picture at 60 Hz, and what is stated."""
+    actor = {"motion": [{"stand": {"seconds": 1}}]}
+    stated = {"drones": {"camera": {"rate_hz": 60, "distortion": []}}}
+    of = [Scenario.model_validate({"schema": k, "duration_s": 1, "actor": actor} | stated) for k in (1, 2)]
+    first, second = (each.drones.camera for each in of)
+    assert (first.readout_ms, second.readout_ms) == (0, pytest.approx(1000 / 60))
+    assert (second.exposure_ms, second.distortion) == (2, [])
+
+
 def scenario(actors: dict[str, Any] | None = None, **parts: Any) -> Scenario:
     """Half a second; two drones 10 m east and north of the first actor, level with the hip."""
     drones = {"camera": {"rate_hz": 10}, "formation": {"tilt_deg": 0}} | parts.pop("drones", {})

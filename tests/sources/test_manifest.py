@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import read_flight
+from pipelines.session.manifest import GimbalSource, read_flight
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs
 from pipelines.sources.poses import FlightPoses
@@ -138,3 +138,5 @@ def test_keys_of_earlier_versions_are_read(flight: SyntheticFlight) -> None:
     today = read({"file": "drone1.tum", "of": "camera"})
     assert read({"tum": "drone1.tum", "of": "camera"}) == today
     assert read({"static": {"path": "drone1.tum", "of": "camera"}}) == today
+    angles = {"yaw_deg": 90, "pitch_deg": -30}
+    assert GimbalSource.model_validate({"fixed": angles}) == GimbalSource.model_validate(angles)
