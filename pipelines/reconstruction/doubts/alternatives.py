@@ -108,10 +108,12 @@ class Trial:
         self.every = list(range(len(self.names)))
         self.moving = [index for index, camera in enumerate(flight.cameras) if not camera.static]
 
-    def named(self, group: Sequence[int], *, of_pair: bool = False) -> tuple[str, ...]:
-        """Name the cameras of a group; of two (`of_pair`) both, if neither can be told to be wrong."""
-        if of_pair and len(self.names) == 2:
-            return self.names
+        # Whether anything but the cameras says where the world is.
+        self.located = flight.hips is not None or flight.ground is not None
+        self.is_loose_pair = not self.located and len(self.moving) == len(self.names) == 2
+
+    def named(self, group: Sequence[int]) -> tuple[str, ...]:
+        """Name the cameras of a group."""
         return tuple(self.names[index] for index in group)
 
     def whose(self, group: Sequence[int]) -> str:
@@ -166,7 +168,7 @@ def rates(trial: Trial) -> Iterator[Alternative]:
             dearer = _PRICE_OF_UNFILMED * float(np.mean(unfilmed))
             yield Alternative(
                 "frame_rate",
-                trial.named(group, of_pair=True),
+                trial.named(group),
                 f"the frame rate of {whose} is {remedies.times_faster(factor)}",
                 remedies.frame_rate(trial.cameras, group, factor),
                 price + max(0.0, dearer) + _PRICE_OF_UNUSUAL_RATE * (not _is_usual(stated_hz / factor)),
@@ -192,7 +194,7 @@ def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
     whose = "all cameras" if alike else trial.names[group[0]]
     return Alternative(
         "clock",
-        trial.named(group, of_pair=True),
+        trial.named(group),
         f"the pictures of {whose} were taken {remedies.earlier_or_later(late_s)}",
         remedies.clock(trial.cameras, group, late_s),
         1.0 + abs(late_s) / 2,
@@ -293,8 +295,7 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
     alone = unit is not None
     if flight.truth_m is not None:
         alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
-    located = flight.truth_m is None and (flight.hips is not None or flight.ground is not None)
-    for of_poses in (alone, not alone) if located else (alone,):
+    for of_poses in (alone, not alone) if flight.truth_m is None and trial.located else (alone,):
         factor, code, cost, remedy = size, "scale", price, f"world.scale: {size:.3g}"
         placed, evidence = flight.scaled(size), {"scale_sigma_share": STATURE_SHARE}
         if of_poses:
@@ -667,12 +668,11 @@ def numbers_of_all(trial: Trial) -> Iterator[Numbers]:
 
 def numbers_of_one(trial: Trial) -> Iterator[Numbers]:
     """Set free what one camera has: where its log has zero and north, how it is turned, its focal length."""
-    located = trial.flight.hips is not None or trial.flight.ground is not None
     for index, kind in product(trial.every, NUMBERS):
         if index not in trial.moving and kind != "focal":
             continue
-        if kind in ("north", "zero") and len(trial.names) == 2 and index == 0 and not located:
-            continue  # of two, one alone can be turned against the other
+        if kind in ("shift", "north", "zero") and index == 0 and trial.is_loose_pair:
+            continue  # of two, one alone can be placed beside the other
         yield _numbers(trial, kind, [index])
 
 
@@ -713,7 +713,6 @@ def _of_numbers(
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
     shift = numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
     far = f"{np.linalg.norm(shift):.1f} m"
-    mounted = kind in ("pitch", "roll", "focal")  # of one camera, whatever the others
     what = {
         "shift": f"the log of {whose} has its zero {far} from the world's",
         "north": f"the log of {whose} has its north {degrees:+.0f} deg from the world's",
@@ -723,8 +722,6 @@ def _of_numbers(
         "roll": f"{whose} is rolled by {degrees:+.0f} deg about the optical axis",
         "focal": f"the focal length of {whose} is {zoom(number):.3g} times what is stated",
     }[kind]
-    if not mounted and len(trial.names) == 2 and len(group) == 1:
-        what += f" (relative to {trial.names[1 - group[0]]}: either may be wrong)"
     if kind == "focal":
         code, remedy = "intrinsics", remedies.intrinsics(cameras, group, zoom(number))
     elif kind in ("shift", "north", "zero"):
@@ -742,8 +739,7 @@ def _of_numbers(
     if kind not in ("shift", "focal") and variance.size:
         evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
     price = PRICE_OF_ONE if len(group) < len(trial.names) else _OF_ALL[kind]
-    named = trial.named(group, of_pair=not mounted)
-    return Alternative(code, named, what, remedy, price, evidence=evidence)
+    return Alternative(code, trial.named(group), what, remedy, price, evidence=evidence)
 
 
 def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:

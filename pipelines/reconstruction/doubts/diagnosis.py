@@ -188,14 +188,17 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
     doubts = []
     for name, found in moved.items():
         late_s, sigma_s = float(found["offset_s"]), float(found["sigma_s"])
+        offset = remedies.offset_of(description.cameras[name], late_s)
+        either = found["by"] == "keypoints" and len(description.cameras) == 2
+        beside = ", though the other camera's clock may be the wrong one" if either else ""
         doubts.append(
             Doubt(
                 code="clock",
                 cameras=[name],
                 what=f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
-                f" {said[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that",
+                f" {said[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}",
                 evidence={"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)},
-                remedy=f"cameras.{name}.{remedies.offset_of(description.cameras[name], late_s)}",
+                remedy="" if beside else f"cameras.{name}.{offset}",
             )
         )
     return doubts
@@ -497,9 +500,10 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> tuple[li
     something odd is no cause. Also return the most that any alternative lowers the objective by.
     """
     by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=lambda each: each.total)
-    weighed = []
+    known, weighed = [], []
     for each in [*by_score[:_FITTED], *(each for each in tried if np.isfinite(each.cost))]:
         found = objective.compared(each)
+        known.append((found.gain, each.alternative))
         if found.is_enough(each.alternative, odd):
             misfits = (found.score_before + found.rays_before, found.score_after + found.rays_after)
             weighed.append((found.gain, each._replace(misfits=misfits)))
@@ -514,7 +518,34 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> tuple[li
     for gain, each in sorted(causes, key=lambda pair: pair[1].numbers):
         simplest.setdefault(each.alternative.code, (gain, each))
     by_gain = sorted(simplest.values(), key=lambda pair: (pair[1].numbers > 0, -pair[0]))
-    return [each for _, each in by_gain], max((gain for gain, _ in weighed), default=0.0)
+    told = [
+        each._replace(alternative=_of_either(objective.trial, each, gain, known)) for gain, each in by_gain
+    ]
+    return told, max((gain for gain, _ in weighed), default=0.0)
+
+
+def _of_either(
+    trial: Trial, cause: Tried, gain: float, known: Sequence[tuple[float, Alternative]]
+) -> Alternative:
+    """Return a cause of one of two cameras; as one of both, if the other's would explain about as much.
+
+    Then no remedy is sure. Where nothing else places the flight, one log is placed beside the other: the
+    flight is then right but for its place, which nobody knows.
+    """
+    own = cause.alternative
+    other = tuple(name for name in trial.names if name not in own.cameras)
+    if len(trial.names) != 2 or len(other) != 1:
+        return own
+    beside = own.code == "origin" and trial.is_loose_pair
+    alike = (
+        _leaves_no_doubt(trial.flight, each)
+        for its, each in known
+        if each.code == own.code and each.cameras == other and gain - its < MARGIN
+    )
+    if not beside and not any(alike):
+        return own
+    what = f"{own.what} (relative to {other[0]}: either may be wrong)"
+    return replace(own, cameras=trial.names, what=what, remedy=own.remedy if beside else "")
 
 
 def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
@@ -537,9 +568,8 @@ def _below_zero(objective: Objective) -> list[Tried]:
     Where all fly about equally high, the rays are alike with z upwards and downwards: no gain is asked for.
     """
     trial = objective.trial
-    located = trial.flight.hips is not None or trial.flight.ground is not None
     height = trial.described.position[trial.moving, :, 2]
-    if located or not np.isfinite(height).any() or np.nanmax(height) > -_BELOW_M:
+    if trial.located or not np.isfinite(height).any() or np.nanmax(height) > -_BELOW_M:
         return []
     place = trial.described.position.copy()
     place[trial.moving, :, 2] *= -1
