@@ -7,7 +7,7 @@ shapes disagree, or stamps do not increase.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,34 +36,24 @@ WORLD_ERRORS = ("w_mpjpe_mm", "wa_mpjpe_mm", "rte_percent", "jitter", "foot_slid
 """The errors of `world_errors`."""
 
 
-@dataclass(frozen=True)
-class JointErrors:
-    """The errors of a set of joints against the truth; NaN where nothing could be measured.
+ERRORS = (
+    *("joint_frames", "reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "e_recon_m2"),
+    *("e_recon_terms", "e_recon_per_joint_frame_m2", "pck150", "pck150_auc", "acceleration_error_mm_s2"),
+)
+"""The errors of a set of joints against the truth; NaN where nothing could be measured.
 
-    `reconstructed_share` is that of the `joint_frames` with truth; `mpjpe_mm` the mean distance, `root_`
-    after both skeletons are moved to their root (without the root itself), `pa_` after a similarity per
-    person-frame (Procrustes); `e_recon_m2` the sum of `e_recon_terms` squared distances; `pck150` the share
-    within 150 mm, missing joints are wrong, `pck150_auc` its mean over thresholds from 0;
-    `acceleration_error_mm_s2` the mean length of the difference, over three consecutive samples.
-    """
-
-    joint_frames: int
-    reconstructed_share: float
-    mpjpe_mm: float
-    root_mpjpe_mm: float
-    pa_mpjpe_mm: float
-    e_recon_m2: float
-    e_recon_terms: int
-    e_recon_per_joint_frame_m2: float
-    pck150: float
-    pck150_auc: float
-    acceleration_error_mm_s2: float
+`reconstructed_share` is that of the `joint_frames` with truth; `mpjpe_mm` the mean distance, `root_` after
+both skeletons are moved to their root (without the root itself), `pa_` after a similarity per person-frame
+(Procrustes); `e_recon_m2` the sum of `e_recon_terms` squared distances; `pck150` the share within 150 mm,
+missing joints are wrong, `pck150_auc` its mean over thresholds from 0; `acceleration_error_mm_s2` the mean
+length of the difference, over three consecutive samples.
+"""
 
 
 def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> dict[str, object]:
     """Compute every error of an estimate against the truth, over all joints and per joint, as JSON.
 
-    The root is `hip`, or the middle of `left_hip` and `right_hip`. The result has the fields of `JointErrors`
+    The root is `hip`, or the middle of `left_hip` and `right_hip`. The result has the `ERRORS`
     (null for what could not be measured), `root_frames_left_out` (person-frames with common joints but
     without a root on both sides), `pa_frames_left_out` (those with fewer than 3 common joints, or on a line)
     and `per_joint`.
@@ -231,13 +221,13 @@ class _Distances:
     acceleration: Float  # [T - 2, P, J]
 
     def errors(self, joints: slice) -> dict[str, float | None]:
-        """Compute the fields of `JointErrors`, JSON-able."""
+        """Compute `ERRORS`, JSON-able."""
         totals = {name: (sums.sum(), weights.sum()) for name, (sums, weights) in self.series(joints).items()}
         terms, judged = totals["reconstructed_share"]
         found = {name: total / weight if weight else math.nan for name, (total, weight) in totals.items()}
         found["e_recon_m2"] = found["e_recon_m2"] if terms else math.nan
-        errors = JointErrors(joint_frames=int(judged), e_recon_terms=int(terms), **found)
-        return _jsonable(asdict(errors))
+        found |= {"joint_frames": int(judged), "e_recon_terms": int(terms)}
+        return _jsonable({name: found[name] for name in ERRORS})
 
     def series(self, joints: slice) -> dict[str, Series]:
         """Compute the same errors at each time; an acceleration is at the middle of its three samples."""

@@ -51,9 +51,11 @@ class PosePriorArrays(NamedTuple):
 
 @helper
 def _sighting(
-    place: Float, turned: Float, origin: Float, direction: Float, inverse: float, across: Float, ray: Float
+    place: Float, turned: Float, points: BackgroundPoints, n: int, ray: Float
 ) -> tuple[Float, Float, Float, bool]:
     """Compute derivatives by pose error [2, 6] and point [2, 3], the residual [2], and if it is in front."""
+    origin, direction, across = points.origin[n], points.direction[n], points.across[n]
+    inverse = points.inverse_depth[n]
     by_pose, by_point, residual = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
     seen, moved = np.zeros(3), np.zeros((3, 3))
     for i in range(3):
@@ -106,15 +108,7 @@ def _point_equations(
     pull[2] = prior[1] * (prior[0] - points.inverse_depth[n])
     for s in range(seen.first[n], seen.first[n + 1]):
         t = seen.picture[s]
-        _, by_point, residual, front = _sighting(
-            place[t],
-            turned[t],
-            points.origin[n],
-            points.direction[n],
-            points.inverse_depth[n],
-            points.across[n],
-            seen.rays[s],
-        )
+        _, by_point, residual, front = _sighting(place[t], turned[t], points, n, seen.rays[s])
         if not front:
             continue
         missed = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
@@ -175,15 +169,7 @@ def eliminate_points(
             t = seen.picture[s]
             mixed = half[s - start]
             mixed[:] = 0.0
-            by_pose, by_point, residual, front = _sighting(
-                place[t],
-                turned[t],
-                points.origin[n],
-                points.direction[n],
-                points.inverse_depth[n],
-                points.across[n],
-                seen.rays[s],
-            )
+            by_pose, by_point, residual, front = _sighting(place[t], turned[t], points, n, seen.rays[s])
             if not front:
                 missed[s] = math.nan
                 continue
@@ -240,15 +226,7 @@ def move_points(
         force = np.zeros(3)
         for s in range(seen.first[n], seen.first[n + 1]):
             t = seen.picture[s]
-            by_pose, by_point, residual, front = _sighting(
-                place[t],
-                turned[t],
-                points.origin[n],
-                points.direction[n],
-                points.inverse_depth[n],
-                points.across[n],
-                seen.rays[s],
-            )
+            by_pose, by_point, residual, front = _sighting(place[t], turned[t], points, n, seen.rays[s])
             if not front:
                 continue
             square = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2

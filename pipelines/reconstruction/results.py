@@ -7,7 +7,7 @@ what limits it.
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import permutations, product
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ from pipelines.geometry.arrays import Float, Int8, Int64
 from pipelines.geometry.gait import HEEL_STRIKE, SIDES, TOE_OFF, GaitEvents, gait_events, summary
 from pipelines.geometry.joint_angles import ANGLE_STATUS, ANGLES, joint_angles
 from pipelines.geometry.metrics import (
+    ERRORS,
     LEVEL,
     RESAMPLES,
     WORLD_ERRORS,
-    JointErrors,
     Series,
     error_series,
     intervals,
@@ -56,7 +56,7 @@ _PER_JOINT = (
 )
 _UNMEASURED = dict.fromkeys(
     [
-        *(field.name for field in fields(JointErrors)),
+        *ERRORS,
         "root_frames_left_out",
         "pa_frames_left_out",
         *WORLD_ERRORS,
