@@ -70,14 +70,13 @@ from pipelines.session.storage import (
     whole_folder,
     write_json,
 )
-from pipelines.session.yaml_files import checked, plain_yaml
+from pipelines.session.yaml_files import OPTION_CODES, checked, plain_yaml
 from pipelines.session.yaml_models import YamlModel
 from pipelines.simulate import recorded_motions
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import build_set
 from pipelines.simulation.scenario import read_scenario
 from pipelines.simulation.walks import (
-    CODES,
     IMITATED,
     LEVELS,
     StudyMethod,
@@ -230,7 +229,7 @@ def _study_walk(
     scenario = None if place is None else read_scenario(place)
     if scenario is not None and "seconds" not in stated:
         stated = {**stated, "seconds": (f"{scenario.duration_s:g}",)}
-    settings, axis = checked(WalkStudy, stated, "study", CODES), varied_most(stated)
+    settings, axis = checked(WalkStudy, stated, "study", OPTION_CODES), varied_most(stated)
     noise = {label: LEVELS.get(label, label) for label in settings.noise}
     shown = {"axis": axis, **settings.model_dump(), "noise": noise}
     ingredients: dict[str, object] = {"settings": shown}
@@ -462,7 +461,7 @@ class _WalkWords(YamlModel):
 def _walk_of(text: str) -> OtherWalk:
     """Read a walk like `speed:0.8+delay:2+turn:30`; `logged` is the walk of the log."""
     words = dict(part.partition(":")[::2] for part in text.split("+")) if text != "logged" else {}
-    return OtherWalk(*checked(_WalkWords, words, f"actor={text}", CODES).model_dump().values())
+    return OtherWalk(*checked(_WalkWords, words, f"actor={text}", OPTION_CODES).model_dump().values())
 
 
 def _doubts(scenes: Mapping[str, ReplayScene], maps: Sequence[Occupancy]) -> list[str]:
@@ -533,7 +532,7 @@ class _SessionStudy(Variables):
 
 def _replay_settings(stated: Stated) -> tuple[ReplanSettings, Stated]:
     """Return the settings that all cells share, and the variables of the cells with their values."""
-    given = checked(_SessionStudy, stated, "study", CODES)
+    given = checked(_SessionStudy, stated, "study", OPTION_CODES)
     refuse_unknown(given.arm, logged=False)
     settings = settings_of(
         given.config,

@@ -15,13 +15,15 @@ network's input kept. Positions are pixels, the centre of the top left one at (0
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import PydanticCustomError
 
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.blazepose import DETECTOR as BLAZEPOSE
@@ -29,6 +31,8 @@ from pipelines.keypoints.blazepose import sampled
 from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, get_skeleton, skeleton_with
 from pipelines.session.registries import Person, Region, need
+from pipelines.session.yaml_files import OPTION_CODES, checked
+from pipelines.session.yaml_models import YamlModel
 
 USAGE = """\
 onnx:MODEL.onnx[,option=value...]
@@ -59,21 +63,39 @@ _FATAL = 4
 # --- options -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class OnnxOptions:
+def _short_name(provider: str) -> str:
+    """Return the short name of an execution provider: `cuda` for `CUDAExecutionProvider` and `CUDA`."""
+    return provider.lower().removesuffix("executionprovider")
+
+
+def _known_skeleton(name: str) -> str:
+    if name not in SKELETONS:
+        raise PydanticCustomError("literal_error", "there are {names}", {"names": ", ".join(SKELETONS)})
+    return name
+
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Side = Annotated[int, Field(ge=10, lt=10_000)]
+Colours = Literal["rgb", "bgr"]
+_BY_SLASHES = BeforeValidator(lambda text: text.split("/") if isinstance(text, str) else text)
+_BY_X = BeforeValidator(lambda text: text.split("x") if isinstance(text, str) else text)
+
+
+class OnnxOptions(YamlModel):
     """Parsed argument of `onnx:`."""
 
     model: Path
     people: Path | None = None
-    people_norm: str = "none"
-    people_colours: str = "bgr"
-    skeleton: str | None = None
+    people_norm: Literal["none", "imagenet"] = "none"
+    people_colours: Colours = "bgr"
+    skeleton: Annotated[str, AfterValidator(_known_skeleton)] | None = None
     heatmap: HeatmapCells = "udp"
-    mean: Three = _IMAGENET[0]
-    std: Three = _IMAGENET[1]
-    colours: str = "rgb"
-    size: tuple[int, int] | None = None
-    provider: str = "cpu"
+    mean: Annotated[tuple[Number, Number, Number], _BY_SLASHES] = _IMAGENET[0]
+    std: Annotated[tuple[Positive, Positive, Positive], _BY_SLASHES] = _IMAGENET[1]
+    colours: Colours = "rgb"
+    size: Annotated[tuple[Side, Side], _BY_X] | None = None
+    provider: Annotated[str, Field(pattern=r"^\w+$"), AfterValidator(_short_name)] = "cpu"
     stated: tuple[tuple[str, str], ...] = ()
     """The options as written, sorted, without paths and provider."""
 
@@ -85,70 +107,16 @@ def parse_options(argument: str) -> OnnxOptions:
     given: dict[str, str] = {}
     for part in parts[first:]:
         name, _, value = part.partition("=")
-        if name in given or name not in _READERS:
-            problem = f"states {name} twice" if name in given else f"no option {name!r}"
-            code = "stated-twice" if name in given else "no-such-name"
-            raise DataError(f"onnx:{argument}", problem, f"there are {', '.join(_READERS)}", code=code)
+        if name in given:
+            raise DataError(f"onnx:{argument}", f"states {name} twice", "state it once", code="stated-twice")
         given[name] = value
-    read: dict[str, Any] = {name: _READERS[name](f"{name}={value}", value) for name, value in given.items()}
     stated = tuple(sorted((name, given[name]) for name in given if name not in ("people", "provider")))
-    return OnnxOptions(Path(",".join(parts[:first])).expanduser(), **read, stated=stated)
-
-
-def _one_of(*choices: str) -> Callable[[str, str], str]:
-    def read(place: str, value: str) -> str:
-        if value not in choices:
-            raise DataError(place, "no such choice", f"there are {', '.join(choices)}", code="no-such-name")
-        return value
-
-    return read
-
-
-def _provider(place: str, value: str) -> str:
-    if not re.fullmatch(r"\w+", value, re.ASCII):
-        raise DataError(place, "names no execution provider", "write its name, such as cpu or cuda")
-    return _short_name(value)
-
-
-def _three(place: str, value: str) -> Three:
-    try:
-        red, green, blue = (float(part) for part in value.split("/"))
-    except ValueError:
-        red = green = blue = np.nan
-    if not np.isfinite([red, green, blue]).all() or (place.startswith("std") and min(red, green, blue) <= 0):
-        raise DataError(
-            place, "is not three numbers of that kind", "write 123.7/116.3/103.5", code="bad-value"
-        )
-    return red, green, blue
-
-
-def _wide_and_high(place: str, value: str) -> tuple[int, int]:
-    found = re.fullmatch(r"([1-9]\d{1,3})x([1-9]\d{1,3})", value)
-    if found is None:
-        raise DataError(place, "is no size", "write width x height: size=192x256", code="bad-value")
-    return int(found[1]), int(found[2])
-
-
-_READERS: dict[str, Callable[[str, str], object]] = {
-    "people": lambda _, value: Path(value).expanduser(),
-    "people_norm": _one_of(*_PEOPLE_NORMS),
-    "people_colours": _one_of("bgr", "rgb"),
-    "skeleton": _one_of(*SKELETONS),
-    "heatmap": _one_of(*get_args(HeatmapCells)),
-    "mean": _three,
-    "std": _three,
-    "colours": _one_of("rgb", "bgr"),
-    "size": _wide_and_high,
-    "provider": _provider,
-}
+    values: dict[str, object] = {**given, "model": ",".join(parts[:first]), "stated": stated}
+    values |= {name: Path(str(values[name])).expanduser() for name in ("model", "people") if name in values}
+    return checked(OnnxOptions, values, f"onnx:{argument}", OPTION_CODES)
 
 
 # --- a network -----------------------------------------------------------------------------------------
-
-
-def _short_name(provider: str) -> str:
-    """Return the short name of an execution provider: `cuda` for `CUDAExecutionProvider` and `CUDA`."""
-    return provider.lower().removesuffix("executionprovider")
 
 
 class OnnxNetwork:
@@ -584,7 +552,7 @@ class OnnxFamily:
                 raise DataError(path, "does not exist", "give the path of an ONNX model", code="no-such-file")
         people = None if options.people is None else options.people.absolute()
         # Other processes, with other working directories, may run it.
-        return OnnxDetector(replace(options, model=options.model.absolute(), people=people))
+        return OnnxDetector(options.model_copy(update={"model": options.model.absolute(), "people": people}))
 
 
 DETECTOR = OnnxFamily()

@@ -30,6 +30,10 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
     return checked(model, raw, path)
 
 
+OPTION_CODES = {"literal_error": "no-such-name", "extra_forbidden": "no-such-name", "twice": "stated-twice"}
+"""Codes of problems, by pydantic's types, in options of the command line."""
+
+
 def checked(
     model: type[M],
     values: Mapping[str, object],

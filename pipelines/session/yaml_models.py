@@ -118,7 +118,8 @@ def describe_problem(
         known = list(_fields_at(model, problem["loc"][:-1]))
         return f"{place}: {unknown_key(str(problem['loc'][-1]), known)}"
     if problem["type"] == "missing":
-        examples = _fields_at(model, problem["loc"][:-1])[problem["loc"][-1]].examples
+        *above, key = problem["loc"]
+        examples = _fields_at(model, tuple(above))[key].examples if isinstance(key, str) else None
         return f"{place}: is missing" + (f", for example {examples[0]}" if examples else "")
     if problem["type"] in {"model_type", "model_attributes_type", "dict_type"}:
         return f"{place}: must be a mapping (key: value), not {str(problem['input'])[:60]!r}"

@@ -281,9 +281,6 @@ LEVELS = {
 # The refinement falls back to `robust` with fewer pictures, so that its row would be that of `robust`.
 _MIN_TIMES_FOR_AUTO = 20
 
-CODES = {"literal_error": "no-such-name", "extra_forbidden": "no-such-name", "twice": "stated-twice"}
-"""Codes of the problems that pydantic finds in the variables of a study."""
-
 
 class Variables(YamlModel):
     """Variables of a study; each has a tuple of texts, of which only one where one value is expected."""
