@@ -134,7 +134,7 @@ def run_flight(job: Job) -> Outcome:
     outcome = Outcome()
     try:
         with ExitStack() as stack:
-            folder = _patiently(lambda: stack.enter_context(session_here(job.session, create=True)))
+            folder = _wait_while_locked(lambda: stack.enter_context(session_here(job.session, create=True)))
             flight = url_of(job.flight)
             here = fetched(flight, fresh=True) if flight else job.flight
             outcome = _run_stages(replace(job, flight=here, session=folder))
@@ -152,7 +152,7 @@ def _run_stages(job: Job) -> Outcome:
         if failed and not (stage == "report" and _is_ingested(job, failed)):
             continue
         try:
-            unchanged &= _patiently(partial(_run, stage, job))
+            unchanged &= _wait_while_locked(partial(_run, stage, job))
             finished.append(stage)
         except MocapError as error:
             failed = failed or {stage: str(error)}
@@ -193,7 +193,7 @@ def _run(stage: str, job: Job) -> bool:
             return report(job.session, force=job.force).skipped
 
 
-def _patiently(call: Callable[[], T]) -> T:
+def _wait_while_locked(call: Callable[[], T]) -> T:
     """Call a function; if a session is locked, wait a while for an abandoned worker that is still ending."""
     until_s = time.monotonic() + MAX_WAIT_FOR_OWNER_S
     while True:

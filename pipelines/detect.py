@@ -305,7 +305,7 @@ class _Work:
         return range(first, block.stop, self.every)
 
     def frames(self, block: Block) -> tuple[Int64, Int64]:
-        """Numbers and times of the frames that are looked at."""
+        """Return the numbers and times of the frames that are looked at."""
         frame, t_ns = self.times(block.camera)
         rows = list(self.rows(block))
         return frame[rows], t_ns[rows]

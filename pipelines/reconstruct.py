@@ -246,7 +246,7 @@ def reconstruct(
         )
         stored = next(attempts)
         doubts = _doubts(flight, stored)
-        _refuse_nothing(folder, stored, doubts)
+        _raise_if_nothing_was_measured(folder, stored, doubts)
         gait, walks = gait_of(stored.observations, stored.result)
         bodies = stored.bodies
         if bodies is None:
@@ -363,7 +363,7 @@ def _followed(
     return record, None
 
 
-def _refuse_nothing(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> None:
+def _raise_if_nothing_was_measured(folder: Path, attempt: Attempt, doubts: Sequence[Doubt]) -> None:
     status = attempt.result.status
     if (status == STATUS.index("ok")).any():
         return

@@ -689,5 +689,5 @@ def _named(row: dict[str, Any], among: Sequence[dict[str, Any]] = ()) -> str:
         "tilt_deg": f" at {row['tilt_deg']:g} deg",
         "robots": f" with {row['robots']} drones",
     } | {name: f", {name}={value}" for name, value in row.items() if name not in usual}
-    told = [name for name in words if not among or len({str(other[name]) for other in among}) > 1]
-    return f"{row['arm']}" + "".join(words[name] for name in told)
+    shown_names = [name for name in words if not among or len({str(other[name]) for other in among}) > 1]
+    return f"{row['arm']}" + "".join(words[name] for name in shown_names)

@@ -279,11 +279,11 @@ def find_gaps(stamps_ns: Int64) -> list[StampGap]:
             before_s, after_s = off_s[max(k - 2 * _MIN_MESSAGES, 0) : k], off_s[k + 1 :][: 2 * _MIN_MESSAGES]
             around = np.abs(np.concatenate([before_s, after_s]))
             # A late message is followed by a shorter interval, and the step of a clock is not.
-            lasts_s = float(off_s[max(k - 2, 0) : k + 3].sum())
+            lasting_s = float(off_s[max(k - 2, 0) : k + 3].sum())
             if (
                 min(k, len(interval_s) - 1 - k) >= _MIN_MESSAGES
                 and np.quantile(around, _SEPARATED_SHARE) < abs(off_s[k]) / 4
-                and abs(lasts_s - off_s[k]) < abs(off_s[k]) / 2
+                and abs(lasting_s - off_s[k]) < abs(off_s[k]) / 2
             ):
                 found.append(StampGap(k + 1, usual_s, float(off_s[k])))
     return sorted(found, key=lambda gap: gap.index)

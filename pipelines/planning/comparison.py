@@ -349,10 +349,10 @@ def filmed_verdict(
     """Say what the films of the arms show; where the modelled measurement said otherwise, say that, too."""
     if best is not None and (best["difference"]["pck150"] or {}).get("interval") is None:
         return f"filmed: too few pictures to tell {' and '.join(names)} apart"
-    said = f"filmed: {verdict(best, names)}"
+    words = f"filmed: {verdict(best, names)}"
     if best is None or modelled is None or outcome(best) == outcome(modelled):
-        return said
-    return f"{said}. The model said otherwise ({outcome(modelled)}): the film counts"
+        return words
+    return f"{words}. The model said otherwise ({outcome(modelled)}): the film counts"
 
 
 def _with_interval(found: MeanWithInterval | None, scale: float, unit: str) -> str:
@@ -379,12 +379,12 @@ def _unequal(arms: Mapping[str, Mapping[str, Any]]) -> list[str]:
     found = []
     counts = {name: arm["drones"] for name, arm in arms.items()}
     if len(set(counts.values())) > 1:
-        said = ", ".join(f"{name} {count}" for name, count in counts.items())
-        found.append(f"the arms have different numbers of drones ({said}): more views measure better")
+        shown = ", ".join(f"{name} {count}" for name, count in counts.items())
+        found.append(f"the arms have different numbers of drones ({shown}): more views measure better")
     ranges = {name: arm["range_m"]["mean"] for name, arm in arms.items()}
     if max(ranges.values()) - min(ranges.values()) > SAME_RANGE_M:
-        said = ", ".join(f"{name} {mean:.1f} m" for name, mean in ranges.items())
-        found.append(f"the arms film from different mean ranges ({said}), which may explain a difference")
+        shown = ", ".join(f"{name} {mean:.1f} m" for name, mean in ranges.items())
+        found.append(f"the arms film from different mean ranges ({shown}), which may explain a difference")
     return found
 
 

@@ -209,9 +209,9 @@ def walked_otherwise(flight: LoggedFlight, walk: OtherWalk, maps: Sequence[Occup
             climb_m = np.convolve(padded, np.ones(second) / second, "valid")
 
     def moved(stamps: Int64, at: Callable[[Int64], Float]) -> tuple[Int64, Float]:
-        lasts_ns = (stamps[-1] - first_ns) / walk.speed + walk.delay_s * 1e9
+        duration_ns = (stamps[-1] - first_ns) / walk.speed + walk.delay_s * 1e9
         step_ns = max(int(np.median(np.diff(stamps))), 1)
-        new_ns = np.arange(min(stamps[0], first_ns), first_ns + lasts_ns, step_ns).astype(np.int64)
+        new_ns = np.arange(min(stamps[0], first_ns), first_ns + duration_ns, step_ns).astype(np.int64)
         walked_ns = walk.speed * (new_ns - first_ns)
         stands_ns = when_ns - first_ns
         late_ns = np.clip(walked_ns - stands_ns, 0.0, walk.speed * walk.delay_s * 1e9)
@@ -399,8 +399,8 @@ def _cameras(
                 noise=noise,
             )
         )
-    said_by = "nobody" if "nobody" in stating else ", ".join(sorted(stating))
-    return tuple(cameras), "truth" if true_poses else "log", said_by
+    noise_source = "nobody" if "nobody" in stating else ", ".join(sorted(stating))
+    return tuple(cameras), "truth" if true_poses else "log", noise_source
 
 
 def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:

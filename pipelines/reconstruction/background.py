@@ -104,7 +104,7 @@ _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1
 """Start of estimated levels. White positions that are free by more confuse far and near points at first."""
 
 _UNKNOWN_ARM_M, _USUAL_ARM_M = 0.05, 0.03  # constant shift in the camera: a lever arm that is wrong
-# Mounts and compasses of usual drones are off by this angle for good.
+# Mounts and compasses of usual drones have a constant error of this angle.
 _USUAL_TURN = float(np.radians(0.15))
 # A mount that nobody knows, or a wrong compass, may be off by this.
 _ANY_TURN_RAD = 0.5

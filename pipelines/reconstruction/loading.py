@@ -21,7 +21,7 @@ from pipelines.geometry.noise import (
     pose_errors,
     sum_sigma,
 )
-from pipelines.reconstruction.log_stretches import Mended, mend, said_stretches
+from pipelines.reconstruction.log_stretches import Mended, mend, warnings_of_stretches
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.camera_poses import parsed_noise_models, stated_models, stated_noise
 from pipelines.session.description import Description
@@ -120,7 +120,7 @@ def _load_camera(
     frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES).iloc[source.looked_at]
     trajectory = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
     mended = Mended(trajectory, None, 0, 0, 0, 0.0) if entry.poses.static else mend(trajectory)
-    warnings += said_stretches(name, mended)
+    warnings += warnings_of_stretches(name, mended)
     keypoints = read_table(source.table, KEYPOINTS)
     if (keypoints["frame"] > frames["frame"].max()).any():
         raise DataError(

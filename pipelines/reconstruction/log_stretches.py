@@ -122,7 +122,7 @@ def _bridged(log: Trajectory, before: int, after: int, kind: int) -> Trajectory:
     return replace(log, quaternion_xyzw=own)
 
 
-def said_stretches(name: str, mended: Mended) -> list[str]:
+def warnings_of_stretches(name: str, mended: Mended) -> list[str]:
     """State which poses of a camera's log lost their weight."""
     if not mended.poses:
         return []

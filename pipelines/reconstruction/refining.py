@@ -499,10 +499,10 @@ class FlightWindow:
 
 def windows_of(t_s: Float, keypoints: int) -> list[FlightWindow]:
     """Divide the times [T] of so many keypoints into windows of equal length; a short flight is one."""
-    lasts_s = float(t_s[-1] - t_s[0])
-    by_memory = min(len(t_s) * keypoints / MAX_KEYPOINTS, lasts_s / MIN_WINDOW_S)
-    count = int(np.ceil(max(lasts_s / MAX_WINDOW_S, by_memory, 1.0)))
-    edges = t_s[0] + np.linspace(0.0, lasts_s, count + 1)
+    duration_s = float(t_s[-1] - t_s[0])
+    by_memory = min(len(t_s) * keypoints / MAX_KEYPOINTS, duration_s / MIN_WINDOW_S)
+    count = int(np.ceil(max(duration_s / MAX_WINDOW_S, by_memory, 1.0)))
+    edges = t_s[0] + np.linspace(0.0, duration_s, count + 1)
     edges[0], edges[-1] = -np.inf, np.inf
     reach_s = OVERLAP_S / 2
     found = []

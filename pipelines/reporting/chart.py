@@ -75,7 +75,7 @@ FAR_FROM_ZERO_M = 10_000.0
 # One shade on the other still shows the lines below.
 SHADE_OPACITY = 0.17
 # More series are not told one by one in the description of a figure.
-MOST_SERIES_TOLD = 12
+MOST_SERIES_DESCRIBED = 12
 
 TIME_LABEL = "time (s)"
 """Label of an axis on which the page's viewer shows and takes moments."""
@@ -311,7 +311,7 @@ def _rows_of(panel: Panel) -> Iterator[dict[str, object]]:
 
 def _in_words(panel: Panel) -> str:
     """Describe a panel: of each series the range and the median; of rows the value of each."""
-    told = []
+    described = []
     for mark in panel.marks:
         if panel.rows is not None and isinstance(mark, Bars | Points):
             own = (
@@ -322,16 +322,20 @@ def _in_words(panel: Panel) -> str:
             values = listing(
                 f"{panel.rows.get(round(row), '')} {significant(float(value))}" for row, value in own
             )
-            told.append(f"{mark.name}: {values}" if mark.name else values)
+            described.append(f"{mark.name}: {values}" if mark.name else values)
         elif isinstance(mark, Line | Points) and mark.name:
             known = np.asarray(mark.y)[np.isfinite(mark.y)]
             if known.size:
                 low, middle, high = (
                     significant(float(v)) for v in (known.min(), np.median(known), known.max())
                 )
-                told.append(f"{mark.name} {low} to {high}, median {middle}")
-    left = f"; and {len(told) - MOST_SERIES_TOLD} more" if len(told) > MOST_SERIES_TOLD else ""
-    return f"{panel.what}: {'; '.join(told[:MOST_SERIES_TOLD])}{left}." if told else ""
+                described.append(f"{mark.name} {low} to {high}, median {middle}")
+    left = (
+        f"; and {len(described) - MOST_SERIES_DESCRIBED} more"
+        if len(described) > MOST_SERIES_DESCRIBED
+        else ""
+    )
+    return f"{panel.what}: {'; '.join(described[:MOST_SERIES_DESCRIBED])}{left}." if described else ""
 
 
 # --- drawing ---

@@ -449,7 +449,7 @@ class Glance:
     label: str
     value: str
     usual: str
-    odd: bool  # outside the usual range
+    unusual: bool  # outside the usual range
 
 
 def at_a_glance(summary: Summary) -> list[Glance]:
@@ -502,7 +502,9 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
         lead = "This session was ingested, but not reconstructed yet."
         return Verdict("", lead, why=worst, next=f"mocap reconstruct {session}", doubts=doubts)
     if summary.motion is None or summary.nothing_measured:
-        return Verdict("wrong", _why_nothing(summary), why=worst, next=f"mocap info {session}", doubts=doubts)
+        return Verdict(
+            "wrong", _reason_for_no_result(summary), why=worst, next=f"mocap info {session}", doubts=doubts
+        )
     given = section(summary.metrics, "verdict")
     grade = text(given, "grade")
     lead = f"{percent(summary.share)} of the joints were measured."
@@ -520,7 +522,7 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
     return Verdict(grade, lead, error, why, following, doubts)
 
 
-def _why_nothing(summary: Summary) -> str:
+def _reason_for_no_result(summary: Summary) -> str:
     if not summary.counts:
         return "Nothing was reconstructed: the skeleton has no rows."
     word, count = max(summary.counts.items(), key=lambda item: item[1])

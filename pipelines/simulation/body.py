@@ -67,8 +67,8 @@ def cut(patch: Patch, keep: Float) -> Patch:
     """Return the part of a patch where `keep` [V], linear in triangles, is not negative; edges split."""
     inside = keep[patch.faces] >= 0
     count = inside.sum(axis=1)
-    one = _odd_first(patch.faces[count == 1], inside[count == 1])
-    two = _odd_first(patch.faces[count == 2], ~inside[count == 2])
+    one = _differing_corner_first(patch.faces[count == 1], inside[count == 1])
+    two = _differing_corner_first(patch.faces[count == 2], ~inside[count == 2])
     crossed = np.concatenate([one[:, [0, 1]], one[:, [0, 2]], two[:, [0, 1]], two[:, [0, 2]]])
     edges, which = np.unique(np.sort(crossed, axis=1), axis=0, return_inverse=True)
     one_b, one_c, two_b, two_c = np.split(
@@ -105,9 +105,9 @@ def together(patches: list[Patch], names: tuple[str, ...]) -> Patch:
     return Patch({name: np.concatenate([patch.values[name] for patch in patches]) for name in names}, faces)
 
 
-def _odd_first(faces: Index, odd: NDArray[np.bool_]) -> Index:
+def _differing_corner_first(faces: Index, differs: NDArray[np.bool_]) -> Index:
     """Rotate each triangle's corners, in their order, until the one that differs comes first."""
-    turn = (np.argmax(odd, axis=1)[:, None] + np.arange(3)) % 3
+    turn = (np.argmax(differs, axis=1)[:, None] + np.arange(3)) % 3
     return np.take_along_axis(faces, turn, axis=1)
 
 

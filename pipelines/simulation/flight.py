@@ -97,7 +97,7 @@ class SimulatedFlight:
     t_ns: Int64  # [T] since the flight's start
 
     def moments_of(self, drone: SimulatedDrone) -> Int64:
-        """The rows [F] of `t_ns` at which a drone took its pictures."""
+        """Return the rows [F] of `t_ns` at which a drone took its pictures."""
         return np.searchsorted(self.t_ns, drone.at_frames.t_ns)
 
 
@@ -265,7 +265,7 @@ def _span_s(scenario: Scenario) -> tuple[float, float]:
 
 
 def _of_others(person: int) -> list[int]:
-    """The first person has the random numbers of an only one; every other has some of their own."""
+    """Return the part of a random seed that is a person's own; the first has the numbers of an only one."""
     return [person] if person else []
 
 
@@ -327,7 +327,7 @@ def _hidden_by_person(other: SimulatedPerson, around: Float, t_ns: Int64, eye: F
 def _moving(
     actor: Actor, person: PosablePerson, scenario: Scenario, bvh: SkeletalMotion | None, seed: int
 ) -> Moving:
-    """The actor's motion as a function of time since the flight's start."""
+    """Return the actor's motion as a function of time since the flight's start."""
     terrain = raise_mounds(scenario.world.mounds)
     start = np.array(actor.start)
 

@@ -298,7 +298,7 @@ class LoggedMessage(NamedTuple):
 
 
 def logged_messages(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
-    """The messages of one drone in the order of receipt; the first drone hears of the actors, too."""
+    """Yield the messages of one drone in the order of receipt; the first drone receives the actors, too."""
     messages = [*_odometry(flight, drone), *_gimbal(flight, drone), *_camera_infos(flight, drone)]
     if drone is flight.drones[0]:
         for person in flight.people:

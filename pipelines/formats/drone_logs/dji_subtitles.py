@@ -26,8 +26,8 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     between_repeats,
     of_angles,
     position_track,
+    same_angles_for_every_reference,
     turned_as_stated,
-    whatever_from,
 )
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
@@ -169,7 +169,7 @@ def angles_track(
         dropped[f"{name} out of order"] = late
     continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[kept]), axis=0))
     between = between_refreshed_angles(t_ns[kept], continuous)
-    as_logged = whatever_from(of_angles(between))
+    as_logged = same_angles_for_every_reference(of_angles(between))
     return attitude_track(name, t_ns[kept], turned_as_stated(between), dropped, stated=as_logged)
 
 

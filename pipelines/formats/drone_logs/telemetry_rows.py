@@ -152,7 +152,7 @@ def of_angles(yaw_pitch_roll_deg: Float) -> Float:
         return attitude_from_angles(yaw_pitch_roll_deg, order="ypr", units="deg")
 
 
-def whatever_from(attitude: Float) -> Mapping[RelativeTo, Float]:
+def same_angles_for_every_reference(attitude: Float) -> Mapping[RelativeTo, Float]:
     """Return the same angles for every reference, because the log does not name one and the user may."""
     return {"world": attitude, "body": attitude, "heading": attitude}
 

@@ -28,7 +28,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     pictures_on_gps_time,
     position_track,
     require_position,
-    whatever_from,
+    same_angles_for_every_reference,
     world_from_heading,
 )
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place
@@ -245,7 +245,9 @@ def _gimbal(
             turned[~from_north] = np.nan
         else:
             turned[~from_north] = world_from_heading(body, topic.t_ns()[~from_north], stated[~from_north])
-    return attitude_track(topic.title, topic.t_ns(), turned, dropped, stated=whatever_from(stated))
+    return attitude_track(
+        topic.title, topic.t_ns(), turned, dropped, stated=same_angles_for_every_reference(stated)
+    )
 
 
 def _gps_time(topics: Sequence[UlogTopic]) -> ClockFit | None:

@@ -94,7 +94,7 @@ class Numbers:
 
     make: Callable[[Float], SceneOfMoments]
     starts: Float  # [K, n]; the fit begins at the best of them
-    said: Callable[[Float, Float], Alternative | None]  # of numbers [n] and their covariance [n, n]
+    alternative: Callable[[Float, Float], Alternative | None]  # of numbers [n] and their covariance [n, n]
 
 
 class Trial:
@@ -117,14 +117,14 @@ class Trial:
         return tuple(self.names[index] for index in group)
 
     def whose(self, group: Sequence[int]) -> str:
-        """Name one camera, or say that all are meant."""
+        """Return the name of one camera, or `every camera`."""
         return self.names[group[0]] if len(group) == 1 < len(self.names) else "every camera"
 
-    def groups(self, members: Sequence[int], dearer: float = 0.3) -> Iterator[tuple[list[int], float]]:
+    def groups(self, members: Sequence[int]) -> Iterator[tuple[list[int], float]]:
         """Take all cameras together, then each, which is dearer."""
         if len(members) > 1:
             yield list(members), 0.5
-        yield from (([index], 0.5 + dearer) for index in members)
+        yield from (([index], 0.8) for index in members)
 
     @cached_property
     def mounts(self) -> Float:
@@ -380,11 +380,11 @@ def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
     for order in permutations(trial.every) if 2 <= len(names) <= 5 else ():
         moved = [index for index in trial.every if order[index] != index]
         if moved:
-            said = ", ".join(f"{names[index]} has those of {names[order[index]]}" for index in moved)
+            owners = ", ".join(f"{names[index]} has those of {names[order[index]]}" for index in moved)
             yield Alternative(
                 "videos_swapped",
                 trial.named(moved),
-                f"pictures are exchanged: {said}",
+                f"pictures are exchanged: {owners}",
                 remedies.videos(trial.cameras, order),
                 0.5 if len(names) == 2 else 0.8,  # of more cameras there are more ways
                 scene_of(trial.flight, trial.described, order=order),
@@ -434,7 +434,7 @@ def _gimbals(trial: Trial) -> Iterator[Posed]:
         right = "enu" if of[group[0]].gimbal_axes == "ned" else "ned"
         turned = _ENU_FROM_NED @ rotation @ mounts.mT @ _FLU_FROM_FRD @ mounts
         yield row(group, f"in {right.upper()}: tilts have the wrong sign", f"axes: {right}", turned)
-    for meant, said in _MEANT.items():
+    for meant, stated in _MEANT.items():
         turned, group = rotation.copy(), []
         for index, poses in of.items():
             body = _body(trial, index)
@@ -449,7 +449,7 @@ def _gimbals(trial: Trial) -> Iterator[Posed]:
             turned[index] = frames[meant] @ frames[poses.gimbal].mT @ rotation[index]
             group.append(index)
         if group:
-            yield row(group, said, f"relative_to: {meant}", turned)
+            yield row(group, stated, f"relative_to: {meant}", turned)
 
 
 def _body(trial: Trial, index: int) -> Float | None:
@@ -558,10 +558,10 @@ def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
     for name, metres in _UNITS_M.items():
         what, again = f"the positions are in {name}", f", and {1 / metres:.4g} times what is read"
         for unit, factor, known in ((name, metres, ""), ("m", 1 / metres, again)):
-            said = what.replace(name, unit) + known
+            shown = what.replace(name, unit) + known
             remedy = remedies.pose(cameras, moving, f"unit: {unit}")
             yield Posed(
-                "unit", said, remedy, camera, (place - arms) * factor + arms, kind, price, same_scatter=True
+                "unit", shown, remedy, camera, (place - arms) * factor + arms, kind, price, same_scatter=True
             )
 
 
@@ -765,7 +765,7 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
         position[moved] += numbers.reshape(-1, 1, 3)
         return replace(scene, position=position)
 
-    def said(numbers: Float, covariance: Float) -> Alternative | None:
+    def alternative(numbers: Float, covariance: Float) -> Alternative | None:
         matters = all(_matters(trial, "shift", moved, shift) for shift in numbers.reshape(-1, 3))
         if not matters or not _is_sure(numbers, covariance):
             return None
@@ -777,7 +777,7 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
             "origin", cameras, what, remedy, PRICE_OF_ALL, same_scatter=True, evidence=evidence
         )
 
-    return Numbers(make, np.concatenate(start)[None], said)
+    return Numbers(make, np.concatenate(start)[None], alternative)
 
 
 # --- errors that are larger than stated ------------------------------------------------------------------

@@ -87,7 +87,7 @@ STRAINED = 10.0
 """Chi^2 of constant errors of poses from which numbers of one camera are tried."""
 
 STRANGE = 5.0
-"""Standard deviations from which one oddity is said, whatever the score."""
+"""Standard deviations from which a single unusual measure is a doubt at any score."""
 
 STRANGE_SIZE = 2.5
 """The same of the stature: mistakes of scale are less rare than people below 1.27 m or above 2.12 m."""
@@ -164,7 +164,7 @@ def doubts_of(
     turns = all_turns(cameras, followed)
     first_ns = [description.cameras[camera.name].frames.first_t_ns for camera in cameras]
     late = lateness(cameras, turns, description.pose_interpolation, RATES, first_ns)
-    flight = _less_odd(known(chosen=chosen), known())
+    flight = _more_plausible(known(chosen=chosen), known())
     truth = load_truth(folder, description, JOINTS)
     if flight is not None and truth is not None:
         size_m = stature_m(truth.position[:, 0])
@@ -184,7 +184,7 @@ def doubts_of(
 
 def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, float | str]]) -> list[Doubt]:
     """State which clocks were moved against what is stated of them, and by what evidence."""
-    said = {"background": "the turning of their background shows", "keypoints": "the people in them show"}
+    evidence = {"background": "the turning of their background shows", "keypoints": "the people in them show"}
     doubts = []
     for name, found in moved.items():
         late_s, sigma_s = float(found["offset_s"]), float(found["sigma_s"])
@@ -196,7 +196,7 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
                 code="clock",
                 cameras=[name],
                 what=f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
-                f" {said[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}",
+                f" {evidence[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}",
                 evidence={"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)},
                 remedy="" if beside else f"cameras.{name}.{offset}",
             )
@@ -204,7 +204,7 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
     return doubts
 
 
-def _less_odd(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | None:
+def _more_plausible(chosen: Sampled | None, prominent: Sampled | None) -> Sampled | None:
     """Return the flight with the less odd person; the first if they are alike.
 
     Where most detections of both are others, the prominent person is not the one who was logged.
@@ -283,12 +283,14 @@ def diagnose(
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
         named |= {"clock"} if "frame_rate" in named else set()
-        doubts += [each for each in _oddities(trial, found, alone=not doubts) if each.code not in named]
+        doubts += [
+            each for each in _unusual_measures(trial, found, alone=not doubts) if each.code not in named
+        ]
     return doubts
 
 
 def _is_strange(described: Score) -> bool:
-    """Test if a single oddity is so large that it is said, whatever the total."""
+    """Test if a single unusual measure is a doubt at any total."""
     limits = {"size": STRANGE_SIZE, "unposed": np.inf}  # a log may end early
     return any(each.sigmas >= limits.get(name, STRANGE) for name, each in described.odd.items())
 
@@ -431,7 +433,7 @@ class Objective:
 
         start = min(free.starts, key=misfit) if len(free.starts) > 1 else free.starts[0]
         found = fit(self.trial.flight, free.make, start, [_LOOSE] * len(start))
-        alternative = free.said(found.numbers, found.covariance)
+        alternative = free.alternative(found.numbers, found.covariance)
         if alternative is None or not np.isfinite(found.cost):
             return None
         size, normal = alternatives.sizes(found.numbers), np.linalg.pinv(found.covariance)
@@ -636,10 +638,10 @@ def _of_looks(trial: Trial, looks: Mapping[int, Callable[[], tuple[float, float]
     """State which cameras look beside their logs, as their backgrounds show, and let their films say how."""
     found = {index: seen for index, find in looks.items() if (seen := find()) is not None}
     degrees = {trial.names[index]: np.degrees(seen).round(1).tolist() for index, seen in found.items()}
-    said = ", ".join(f"{name} by {angle:.0f} deg" for name, (angle, _) in degrees.items())
+    angles = ", ".join(f"{name} by {angle:.0f} deg" for name, (angle, _) in degrees.items())
     evidence = {f"aside_deg_{name}": angle for name, (angle, _) in degrees.items()}
     evidence |= {f"aside_sigma_deg_{name}": sigma for name, (_, sigma) in degrees.items()}
-    what = f"the background shows that the camera looks elsewhere than logged: {said}"
+    what = f"the background shows that the camera looks elsewhere than logged: {angles}"
     remedy = remedies.by_pictures(trial.cameras, list(found))
     return [Tried(Alternative("mount", tuple(degrees), what, remedy, 0.0, evidence=evidence))] * bool(found)
 
@@ -663,7 +665,7 @@ def _of_logs(objective: Objective) -> list[Tried]:
     return found
 
 
-# --- what is said -----------------------------------------------------------------------------------------
+# --- texts of doubts ----------------------------------------------------------------------------------
 
 
 def _doubt(trial: Trial, cause: Tried, described: Score, codes: Sequence[str]) -> Doubt:
@@ -693,7 +695,7 @@ def _doubt(trial: Trial, cause: Tried, described: Score, codes: Sequence[str]) -
 
 
 # What is odd about a person, by the name it has in a score: the code of its doubt, and the sentence.
-_ODD = {
+_UNUSUAL = {
     "size": ("scale", "the person is {stature_m:.3g} m tall; grown-ups are {usual:.2f} m, 95 % within 17 %"),
     "shape": ("body", "the lengths of the limbs are not in the proportions of people"),
     "limp": ("body", "the lengths of the limbs change over time, by {limb_spread:.0%}"),
@@ -722,10 +724,10 @@ _ODD = {
     "parallax": ("residual", "the cameras look from the same side: the rays hardly cross"),
 }
 # What is less odd than this many standard deviations is not worth a sentence.
-_LEAST_ODD = 2.0
+_LEAST_UNUSUAL = 2.0
 
 
-def _oddities(trial: Trial, described: Score, *, alone: bool) -> list[Doubt]:
+def _unusual_measures(trial: Trial, described: Score, *, alone: bool) -> list[Doubt]:
     """State what is odd about the description as such, the oddest of each code, the oddest first.
 
     Where no cause is stated beside it (`alone`), the rays are what is odd if nothing else is.
@@ -733,12 +735,12 @@ def _oddities(trial: Trial, described: Score, *, alone: bool) -> list[Doubt]:
     names = list(trial.names)
     found: dict[str, Doubt] = {}
     for name, (sigmas, measured) in sorted(described.odd.items(), key=lambda item: -item[1].sigmas):
-        if sigmas >= _LEAST_ODD and name in _ODD:
-            code, said = _ODD[name]
-            what = said.format(usual=STATURE_M, **measured)
+        if sigmas >= _LEAST_UNUSUAL and name in _UNUSUAL:
+            code, words = _UNUSUAL[name]
+            what = words.format(usual=STATURE_M, **measured)
             evidence = {key: round(value, 3) for key, value in (*measured.items(), ("sigmas", sigmas))}
             found.setdefault(code, Doubt(code=code, cameras=names, what=what, evidence=evidence, remedy=""))
-    if described.misfit > _LEAST_ODD or (alone and not found):
+    if described.misfit > _LEAST_UNUSUAL or (alone and not found):
         residual_px, *each_px = residuals_px(trial.described)
         evidence = {
             "misfit": round(described.misfit, 2),

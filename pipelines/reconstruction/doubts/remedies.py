@@ -21,8 +21,8 @@ _EYE = np.eye(3)
 _SAME = 1e-3
 
 
-def _lines(cameras: Sequence[Filmed], group: Sequence[int], said: Callable[[Filmed], str]) -> str:
-    return "; ".join(f"cameras.{cameras[index].name}.{said(cameras[index])}" for index in group)
+def _lines(cameras: Sequence[Filmed], group: Sequence[int], key_of: Callable[[Filmed], str]) -> str:
+    return "; ".join(f"cameras.{cameras[index].name}.{key_of(cameras[index])}" for index in group)
 
 
 def clock(cameras: Sequence[Filmed], group: Sequence[int], seconds: float) -> str:
@@ -63,14 +63,14 @@ def earlier_or_later(seconds: float) -> str:
 def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:
     """Give cameras each other's pictures, or keypoints where those came with the flight."""
 
-    def said(camera: Filmed) -> str:
+    def key_of(camera: Filmed) -> str:
         if camera.entry.keypoints is not None:
             return f"keypoints.file: {camera.entry.keypoints.source}"
         media = camera.entry.media
         return f"video: {media.sources[0] if media and media.sources else camera.name}"
 
     return "; ".join(
-        f"cameras.{cameras[index].name}.{said(cameras[other])}"
+        f"cameras.{cameras[index].name}.{key_of(cameras[other])}"
         for index, other in enumerate(order)
         if index != other
     )
@@ -81,7 +81,7 @@ def mount(
 ) -> str:
     """Turn body_from_camera [3, 3] of cameras in either's axes; without a mount what turns the pose."""
 
-    def said(camera: Filmed) -> str:
+    def key_of(camera: Filmed) -> str:
         stored = camera.entry.poses.mount or camera.entry.poses.in_gimbal
         if stored is None:
             forwards = matrix_from_quaternion(body_from_camera("forward"))
@@ -91,20 +91,20 @@ def mount(
         words = _as_words(rotation, stored.translation)
         return f"mount: {words or _rigid(stored.translation, quaternion_from_matrix(rotation))}"
 
-    return _lines(cameras, group, said)
+    return _lines(cameras, group, key_of)
 
 
 def by_pictures(cameras: Sequence[Filmed], group: Sequence[int]) -> str:
     """Let the films of cameras say how they turned, in place of logs, mounts and gimbals."""
 
-    def said(camera: Filmed) -> str:
+    def key_of(camera: Filmed) -> str:
         poses = camera.entry.poses
         if not (poses.mount or poses.in_gimbal or poses.gimbal):
             return "pose.attitude: pictures"
         others = "".join(f"; cameras.{camera.name}.{key}: null" for key in ("pose.of", "mount", "gimbal"))
         return f"pose.attitude: pictures{others}"
 
-    return _lines(cameras, group, said)
+    return _lines(cameras, group, key_of)
 
 
 def down_deg(camera: Filmed) -> float:
@@ -184,11 +184,11 @@ def unit(cameras: Sequence[Filmed], name: str) -> str:
     return _lines(cameras, range(len(cameras)), lambda _: f"pose.unit: {name}")
 
 
-def pose(cameras: Sequence[Filmed], group: Sequence[int], said: str | Callable[[PosesEntry], str]) -> str:
+def pose(cameras: Sequence[Filmed], group: Sequence[int], options: str | Callable[[PosesEntry], str]) -> str:
     """State how the poses of moving cameras are written, beside how they are read."""
 
     def line(camera: Filmed) -> str:
-        stated = said if isinstance(said, str) else said(camera.entry.poses)
+        stated = options if isinstance(options, str) else options(camera.entry.poses)
         return "pose." + stated.format(camera.name)
 
     return _lines(cameras, group, line)
@@ -214,13 +214,13 @@ OF_CAMERA = "of: camera; cameras.{}.mount: null"
 def keypoints_size(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """State the size of the pictures that keypoints are of; of film, calibrate the lens for its pictures."""
 
-    def said(camera: Filmed) -> str:
+    def key_of(camera: Filmed) -> str:
         if camera.entry.keypoints is None:
             return _lens(camera, factor, factor)
         width, height = camera.intrinsics.width * factor, camera.intrinsics.height * factor
         return f"keypoints.image_size: [{width:.0f}, {height:.0f}]"
 
-    return _lines(cameras, group, said)
+    return _lines(cameras, group, key_of)
 
 
 _MIRRORS = {
@@ -272,7 +272,7 @@ def _lens(camera: Filmed, focal: float, centre: float) -> str:
 def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
     """State errors of poses that are larger by a factor: constant ones, and those that change."""
 
-    def said(camera: Filmed) -> str:
+    def key_of(camera: Filmed) -> str:
         sigma = factor * np.array(camera.sigma)
         position, rotation = np.sqrt(np.maximum(sigma[:2] ** 2 - sigma[4:] ** 2, 0.0))
         return (
@@ -280,7 +280,7 @@ def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -
             f" white: {{position_m: {sigma[4]:.3g}, rotation_deg: {np.degrees(sigma[5]):.3g}}}}}"
         )
 
-    return _lines(cameras, [index for index in group if not cameras[index].static], said)
+    return _lines(cameras, [index for index in group if not cameras[index].static], key_of)
 
 
 def origin(cameras: Sequence[Filmed], index: int, shift: Float, yaw_rad: float = 0.0) -> str:
