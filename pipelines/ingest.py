@@ -166,6 +166,7 @@ def ingest(
             map_ = reader.store_map(run.folder, entries)
             plan = reader.store_plan(run.folder, entries)
             origin = reader.origin()
+            unused = reader.unused_gimbals()
             check_sources()
             warnings += reader.take_notes()
             warnings += assumptions_as_warnings(flight.assumptions)
@@ -173,8 +174,7 @@ def ingest(
             tables = {name: run.folder / "cameras" / name / "poses.parquet" for name in entries}
             tracks = {name: trajectory_from(read_table(path, POSES)) for name, path in tables.items()}
             doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
-            doubts += doubts_of_places(tracks, reader.map_box) + reader.poses.map_doubts
-            doubts += reader.unused_gimbals()
+            doubts += doubts_of_places(tracks, reader.map_box) + reader.poses.map_doubts + unused
             warnings += [doubt.as_warning() for doubt in doubts]
 
             description = Description(
@@ -549,20 +549,32 @@ class _FlightReader:
             raise DataError(f"{self._flight_path}: map.file {log}", problem, remedy, code="no-overlap")
 
     def unused_gimbals(self) -> list[Doubt]:
-        """Doubt cameras that are fixed to a body where a log holds angles of a gimbal that nobody names."""
+        """Doubt cameras that are fixed to a body where their log holds angles of a gimbal that nobody names.
+
+        Of other logs, where the gimbal may be of another flight or held still, there is a note.
+        """
+
+        def path(log: str) -> str:
+            return self._flight.paths_of(log)[0]
+
         cameras = self._flight.cameras
-        used = {camera.gimbal.topic for camera in cameras.values() if camera.gimbal is not None}
+        fixed = [name for name, camera in cameras.items() if camera.mount is not None and not camera.gimbal]
+        gimbals = [camera.gimbal for camera in cameras.values() if camera.gimbal and camera.gimbal.file]
+        used = {(path(gimbal.file), gimbal.topic) for gimbal in gimbals}
         found: dict[str, tuple[str, Topic]] = {}
-        for name, camera in cameras.items():
-            log = camera.pose.file
-            if camera.gimbal or camera.mount is None or not self._files.is_log("pose", camera.pose):
-                continue
+        for log in self._files.logs() if fixed else ():
             with self._logs.open(log) as opened:
                 topics = [topic for topic in opened.recording.topics if _is_of_gimbal(topic)]
-            free = [topic for topic in topics if topic.name not in used]
-            own = [topic for topic in free if name in topic.name] or (free if len(free) == 1 else [])
-            if own:
-                found[name] = (log, max(own, key=lambda topic: kind_of(topic) == "angles"))
+            free = [each for each in topics if not used & {(path(log), each.name), (path(log), None)}]
+            for name in fixed:
+                is_own = path(cameras[name].pose.file) == path(log)
+                its = [topic for topic in free if name in topic.name]
+                its = its or (free if len(free) == 1 and (is_own or name in log) else [])
+                if its and is_own:
+                    found[name] = (log, max(its, key=lambda topic: kind_of(topic) == "angles"))
+                elif its:
+                    unsaid = f"{log} holds angles of a gimbal that nothing uses: {its[0].name}"
+                    self._notes.append(f"{name}: {unsaid}; if they turn it, say `gimbal`")
         if not found:
             return []
         names = ", ".join(topic.name for _, topic in found.values())

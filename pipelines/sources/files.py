@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -105,8 +105,8 @@ class FlightFiles:
         where = f"{self._manifest}: {place or part}"
         return options_of(where, part, self.format_of(part, source), source.options, wanted)
 
-    def refuse_other_options(self) -> None:
-        """Recognise every file; DataError for a missing one, a wrong kind, or options not for it."""
+    def _parts(self) -> Iterator[tuple[str, str, FileSource]]:
+        """Yield the parts of the manifest that have a file: where each stands, and its name."""
         parts: list[tuple[str, str, FileSource | None]] = []
         for name, camera in self._flight.cameras.items():
             named = ("video", "frame_times", "pose", "gimbal", "intrinsics", "keypoints")
@@ -114,8 +114,17 @@ class FlightFiles:
         parts += [("map", "map", self._flight.map), ("truth", "truth", self._flight.truth)]
         parts += [(f"plan.{name}", "plan", source) for name, source in self._flight.plan.items()]
         for place, part, source in parts:
-            if source is None or not source.file:
-                continue
+            if source is not None and source.file:
+                yield place, part, source
+
+    def logs(self) -> list[str]:
+        """Return the logs of topics that the manifest lists or reads, each once, in that order."""
+        read = [source.file for _, part, source in self._parts() if self.is_log(part, source)]
+        return list({self._flight.paths_of(log)[0]: log for log in [*read, *self._flight.logs]}.values())
+
+    def refuse_other_options(self) -> None:
+        """Recognise every file; DataError for a missing one, a wrong kind, or options not for it."""
+        for place, part, source in self._parts():
             self.options(part, source, YamlModel, place)
             if source.topic is not None and not self.is_log(part, source):
                 problem = f"has a topic, and {source.file} is no log ({self.format_of(part, source).title})"
