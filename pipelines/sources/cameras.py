@@ -24,6 +24,9 @@ from pipelines.sources.parts import CameraFrames
 # So many frames last 18 hours at 30 Hz: a larger number was misread from a date.
 MAX_FRAMES = 2_000_000
 
+# Containers round stamps to 1 ms, which at 240 Hz is a quarter of the interval.
+_EVEN = 0.25
+
 # Shares of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. But if the
 # pictures have another size, keypoints lie beyond the right and the lower border only: all begin at 0.
 MAX_SHARE_BEYOND = 0.2
@@ -71,12 +74,16 @@ class FlightCameras:
             logged = self._logs.frames(camera.video.file, camera.video.topic)
         pictures = _pictures(video, logged)
         if times.fps is not None:
-            count = len(pictures.t_ns) if pictures else self._listed_frames(camera, detections)
+            taken = np.arange(len(pictures.t_ns) if pictures else self._listed_frames(camera, detections))
+            if video is not None:
+                taken = _numbers_as_taken(video.pts_ns)
+            if lost_count := int(taken[-1]) + 1 - len(taken):
+                self._note(f"{name}: {lost_count} pictures are missing by its stamps; fps counts them, too")
             # Python's integers never overflow.
-            since_start = np.array([round(k * 10**9 / times.fps) for k in range(count)], dtype=np.int64)
+            since_start = np.array([round(k * 10**9 / times.fps) for k in taken.tolist()], dtype=np.int64)
             topic, lost = (pictures.topic, pictures.dropped) if pictures else (None, {})
             start_ns = self._start_ns(name, camera, times)
-            return CameraFrames(np.arange(count), start_ns + since_start, since_start, topic, lost)
+            return CameraFrames(np.arange(len(taken)), start_ns + since_start, since_start, topic, lost)
         if times.file and self._files.is_log("frame_times", times):
             stamped = self._logs.frames(times.file, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
@@ -237,6 +244,16 @@ class FlightCameras:
             if size:
                 return size
         return detections.image_size if detections else None
+
+
+def _numbers_as_taken(pts_ns: Int64) -> Int64:
+    """Number pictures [N] as they were taken, from 0, lost ones among them; by even stamps alone."""
+    steps_ns = np.diff(pts_ns)
+    usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 1.0
+    counts = np.rint(steps_ns / usual_ns).astype(np.int64)
+    if (counts < 1).any() or (np.abs(steps_ns - counts * usual_ns) > _EVEN * usual_ns).any():
+        return np.arange(len(pts_ns))
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
 def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames | None:

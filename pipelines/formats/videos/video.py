@@ -297,11 +297,12 @@ class VideoReader:
 
 @dataclass(frozen=True)
 class _Scan:
-    ticks: Int64  # [N] stamps of the container, in order; numbers in a raw stream
+    ticks: Int64  # [N] stamps of the container, in order; numbers in a raw stream, lost pictures among them
     tick_s: Fraction
     key_frames: list[int]  # sorted numbers, of stamps that no other frame has
     dropped: dict[str, int]
     is_raw: bool = False
+    damaged: int = 0  # coded frames whose bytes are not as a codec writes them
 
 
 class _CodedFrame(NamedTuple):
@@ -310,6 +311,7 @@ class _CodedFrame(NamedTuple):
     position: int | None  # in the file
     pts: int | None
     key: bool
+    sound: bool
 
 
 def _scan(path: Path) -> _Scan:
@@ -325,10 +327,12 @@ def _scan(path: Path) -> _Scan:
 def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
     container, stream = open_container(path)
     with container:
+        codec = stream.codec_context.codec.canonical_name
+        lengths = _bytes_of_lengths(codec, stream.codec_context.extradata or b"")
         stored = [
-            _CodedFrame(packet.pos, packet.pts, packet.is_keyframe)
+            _CodedFrame(packet.pos, packet.pts, packet.is_keyframe, _is_sound(packet, codec, lengths))
             for packet in packets(container, stream)
-            if not packet.is_discard and is_shown(packet, stream.codec_context.codec.canonical_name)
+            if not packet.is_discard and is_shown(packet, codec)
         ]
         # Only a complete table, like that of MP4, lists frames beyond the file's end.
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
@@ -337,11 +341,15 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
     if is_raw:
         container, stream = open_container(path)
         with container:
-            count = sum(1 for _ in _decoded(container, stream, None))
-        if not count:
+            found = [frame.pts or 0 for frame in _decoded(container, stream, None)]
+        if not found:
             raise _undecodable(path, len(stored))
-        unseen = {_NOT_GIVEN: len(stored) - count} if count < len(stored) else {}
-        return _Scan(np.arange(count, dtype=np.int64), Fraction(1), [], unseen, is_raw)
+        unseen = sorted(set(range(len(stored))) - set(found))
+        # Each of them before it in the stream moves a picture by one.
+        before = np.array([bisect.bisect_left(unseen, number) for number in found], np.int64)
+        numbers: Int64 = np.arange(len(found)) + np.maximum.accumulate(before)
+        dropped = {_NOT_GIVEN: len(unseen)} if unseen else {}
+        return _Scan(numbers - numbers[0], Fraction(1), [], dropped, is_raw)
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
@@ -376,6 +384,7 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         tick_s,
         _key_frames(ticks, keys),
         {cause: count for cause, count in counts.items() if count},
+        damaged=sum(not packet.sound for packet in whole),
     )
 
 
@@ -445,6 +454,11 @@ def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
         ends_ns = np.append(pts_ns[starts], pts_ns[-1] + step_ns)
         pts_ns = np.interp(np.arange(len(pts_ns)), np.append(starts, len(pts_ns)), ends_ns).astype(np.int64)
         notes = (f"{again} frames have the stamp of the frame before: spread up to the next stamp",)
+    if scan.damaged:
+        notes += (
+            f"{scan.damaged} coded frames are damaged: they keep their numbers, and a detector that leaves"
+            " them out numbers the frames after them otherwise",
+        )
     return VideoIndex(
         pts_ns=pts_ns,
         start_ns=int(_nanoseconds(scan.ticks[:1], scan.tick_s)[0]),
@@ -473,7 +487,9 @@ def _decoded(
 ) -> Iterator[VideoFrame]:
     from av.error import FFmpegError
 
-    for packet in chain(packets(container, stream), (None,)):
+    for number, packet in enumerate(chain(packets(container, stream), (None,))):
+        if packet is not None and container.format.name in _RAW:
+            packet.pts = number
         if sought and first is None:
             if packet is None or packet.pts is None or not packet.is_keyframe:
                 continue
@@ -626,6 +642,30 @@ def is_shown(packet: Packet[VideoStream], codec: str) -> bool:
     if codec == "vp8":
         return bool(content[0] >> 4 & 1)
     return any(_is_shown_vp9(content[start]) for start in _vp9_frames(content))
+
+
+# The first bytes of every coded picture.
+_STARTS = {"mpeg4": b"\0\0\1", "mjpeg": b"\xff\xd8"}
+
+
+def _bytes_of_lengths(codec: str, stated: bytes) -> int:
+    """Return how many bytes state the length of a unit in MP4 (ISO 14496-15); 0 for other streams."""
+    place = {"h264": 4, "hevc": 21}.get(codec, len(stated))
+    return (stated[place] & 3) + 1 if stated[:1] == b"\1" and place < len(stated) else 0
+
+
+def _is_sound(packet: Packet[VideoStream], codec: str, lengths: int) -> bool:
+    """Test if a coded picture begins as its codec writes it, and its units fill it; damage shows so."""
+    content = memoryview(packet)
+    if not lengths:
+        return content[:3].tobytes().startswith(_STARTS.get(codec, b"")) and not packet.is_corrupt
+    place = 0
+    while place + lengths < len(content):
+        length = int.from_bytes(content[place : place + lengths], "big")
+        if not length or content[place + lengths] & 0x80:  # this bit is always 0
+            return False
+        place += lengths + length
+    return place == len(content)
 
 
 def _vp9_frames(content: bytes) -> list[int]:

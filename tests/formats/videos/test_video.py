@@ -162,6 +162,7 @@ def test_a_damaged_frame_is_missing_and_the_others_keep_their_numbers(
     with VideoReader(path) as reader:
         assert reader.index.pts_ns.tolist() == relative_ns(uneven_ticks(30))
         left = dict(reader.frames())
+        assert ["2 coded frames" in note for note in reader.index.notes] == [True]
         assert reader.missing == {7, 20}
         assert reader.read(7) is None
         again = reader.read(8)
@@ -278,6 +279,17 @@ def test_raw_streams_are_numbered_and_have_no_times(
             assert picture is not None
             assert read_bar_code(picture) == number
     assert READER.describe(path)["frames"] == 30
+
+
+def test_a_picture_that_a_raw_stream_lost_keeps_its_time(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.h264", even_ticks(40), b_frames=0, container_format="h264")
+    position, size = packets(path)[25]
+    content = bytearray(path.read_bytes())
+    content[position + 6 : position + size] = b"\x55" * (size - 6)
+    path.write_bytes(content)
+    index = READER.index(path)
+    assert list(index.dropped.values()) == [1]
+    assert (index.pts_ns // 10**9).tolist() == [*range(25), *range(26, 40)]
 
 
 def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
