@@ -45,7 +45,13 @@ from pipelines.formats.logs.messages import all_samples, header_ns, kind_of, sam
 from pipelines.formats.logs.positions import FIXES, pairs_of
 from pipelines.formats.logs.trajectories import attitudes_of, poses_of
 from pipelines.formats.videos.frame_times import FrameTimesFormat, read_frame_times
-from pipelines.formats.videos.picture_folder import FolderPictures, picture_files, read_tags
+from pipelines.formats.videos.picture_folder import (
+    PICTURES,
+    FolderPictures,
+    patterns_of_airsim,
+    picture_files,
+    read_tags,
+)
 from pipelines.formats.videos.video import VideoReader, created_ns
 from pipelines.geometry.arrays import Float, Int64, Intrinsics, Place, RelativeTo
 from pipelines.geometry.geodesy import enu_from_geodetic
@@ -72,7 +78,7 @@ from pipelines.session.registries import (
     TrajectoryFormat,
     VideoFormat,
 )
-from pipelines.session.storage import as_data_error, drop_link
+from pipelines.session.storage import as_data_error, drop_link, is_folder
 from pipelines.sources.attitudes import FilmOfCamera, turned_by_pictures
 from pipelines.sources.parts import CameraFrames
 from pipelines.sources.pictures import open_files
@@ -336,7 +342,10 @@ class _FileSearch:
             return
         children = [c for c in every if c.name[0] != "." and not _is_made(c) and c.exists()]
         formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
-        if formats:
+        patterns = patterns_of_airsim(folder) if PICTURES in formats else []
+        for pattern in patterns:
+            yield pattern, [PICTURES]
+        if formats and not patterns:
             yield folder, formats
         kinds = {_kind_of_format(format_) for format_ in formats}
         for child in children:
@@ -387,7 +396,7 @@ def _why_left_out(path: Path) -> str:
 def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Proposal | FoundLog], str]:
     """Read a thing as every kind that it can be; of several formats of a kind the first that works counts."""
     *folders, name = path.relative_to(home).parts or (path.name,)
-    place = (*folders, name if path.is_dir() else Path(name).stem)
+    place = (*folders, name.strip("_*") if is_folder(path) else Path(name).stem)
     found: dict[type | None, list[Proposal | FoundLog]] = {}
     problems: list[tuple[Format, DataError]] = []
     for format_ in formats:
@@ -444,9 +453,9 @@ def _described(
         about = f"{index.count} frames, {length_ns / 1e9:.6g} s"
         film = FoundFilm("video", *head, about, file, labels, (0, place), frames=index.count)
         film = replace(film, size=(index.width, index.height))
-        made_ns = (index.start_ns or None) if path.is_dir() else created_ns(path)
+        made_ns = (index.start_ns or None) if is_folder(path) else created_ns(path)
         clock = {SHARED_SECONDS: "whole seconds", UNTIMED: "none"}.get(index.codec, "own")
-        focal_35_mm = read_tags(picture_files(path)[0]).focal_35_mm if path.is_dir() else None
+        focal_35_mm = read_tags(picture_files(path)[0]).focal_35_mm if is_folder(path) else None
         yield replace(film, length_ns=length_ns, made_ns=made_ns, clock=clock, focal_35_mm=focal_35_mm)
     elif isinstance(format_, MapFormat):
         try:
@@ -623,7 +632,7 @@ def _followed_points(path: Path) -> TrackedPoints:
     pts_ns = index.pts_ns[index.pts_ns <= (WATCHED_NS if index.codec != UNTIMED else 0)]
     height = round(index.height * WATCHED_WIDTH_PX / index.width)
     follower = Follower()
-    with FolderPictures(path) if path.is_dir() else VideoReader(path) as reader:
+    with FolderPictures(path) if is_folder(path) else VideoReader(path) as reader:
         for number, picture in reader.frames(0, len(pts_ns)):
             grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
             small = cv2.resize(grey, (WATCHED_WIDTH_PX, height), interpolation=cv2.INTER_AREA)

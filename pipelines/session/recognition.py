@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, Format
-from pipelines.session.storage import plain_text, refuse_special, text_encoding
+from pipelines.session.storage import files_in, is_folder, plain_text, refuse_special, text_encoding
 
 F = TypeVar("F")
 
@@ -48,7 +48,7 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
         if isinstance(stated, protocols):
             return stated
         raise DataError(path, f"{name} is no format of a {noun}", "leave `format:` out", code="wrong-kind")
-    if not path.exists():
+    if not (path.exists() or is_folder(path)):
         remedy = "check the path; paths are relative to the file that names them"
         if path.name == "pictures":
             remedy = "films alone give no place: log it, and write {file: track.gpx, attitude: pictures}"
@@ -162,7 +162,7 @@ def describe_lfs_pointer(head: bytes) -> Likeness | None:
 def refuse_pointers(path: Path) -> None:
     """Refuse, with a DataError, a pointer of Git LFS, or a folder that begins with one; pass all else."""
     with suppress(OSError):
-        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        files = sorted(files_in(path)) if is_folder(path) else [path]
         for file in islice(filter(Path.is_file, files), MAX_NAMES_IN_MESSAGE):
             with file.open("rb") as content:
                 if pointer := describe_lfs_pointer(content.read(1024)):

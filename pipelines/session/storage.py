@@ -134,10 +134,10 @@ def sha256_of(path: Path) -> str:
     """
     refuse_special(path)
     try:
-        if not path.is_dir():
+        if not is_folder(path):
             return _file_digest(path).hex()
         digest = hashlib.sha256()
-        for name, file in sorted((file.relative_to(path).as_posix(), file) for file in _files(path)):
+        for name, file in sorted(_files(path)):
             # Zero byte after the name, a digest of fixed length: no two folders run together.
             digest.update(os.fsencode(name) + b"\0" + _file_digest(file))
         return digest.hexdigest()
@@ -148,10 +148,9 @@ def sha256_of(path: Path) -> str:
 def file_stamp(path: Path) -> str:
     """Hash sizes and times of change of a file, or a folder's files: unchanged if nothing was written."""
     try:
-        if not path.is_dir():
+        if not is_folder(path):
             return hash_of(_size_and_change(path))
-        files = ((file.relative_to(path).as_posix(), file) for file in _files(path))
-        return hash_of([[name, *_size_and_change(file)] for name, file in sorted(files)])
+        return hash_of([[name, *_size_and_change(file)] for name, file in sorted(_files(path))])
     except OSError as error:
         raise as_data_error(error, path) from error
 
@@ -166,8 +165,22 @@ def _file_digest(path: Path) -> bytes:
         return hashlib.file_digest(file, "sha256").digest()
 
 
-def _files(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.is_file()]
+def _files(folder: Path) -> list[tuple[str, Path]]:
+    """Return names and paths of all files of a folder, or of a pattern."""
+    if not folder.is_dir():
+        return [(file.name, file) for file in files_in(folder)]
+    return [(file.relative_to(folder).as_posix(), file) for file in folder.rglob("*") if file.is_file()]
+
+
+def files_in(path: Path) -> list[Path]:
+    """Return the files of a folder, without those below, or of a pattern of names (`images/left_*.png`)."""
+    folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
+    return [file for file in folder.glob(pattern) if file.is_file()] if "*" in pattern else []
+
+
+def is_folder(path: Path) -> bool:
+    """Return True for a folder, and for a pattern that names files of one."""
+    return path.is_dir() or bool(files_in(path))
 
 
 def jsonable(value: object) -> Any:

@@ -26,6 +26,7 @@ from pipelines.session.storage import (
     as_data_error,
     hash_of,
     held,
+    is_folder,
     read_json,
     remove_tree,
     sha256_of,
@@ -75,7 +76,8 @@ def located(base: Path, stated: str | Path) -> Path:
         return fetched(url)
     origin = origin_of(base)
     path = origin / stated
-    return path if path.exists() or not (left := first_place_of(origin) / stated).exists() else left
+    left = first_place_of(origin) / stated
+    return left if not (path.exists() or is_folder(path)) and (left.exists() or is_folder(left)) else path
 
 
 def source_url(base: Path, stated: str | Path) -> str | None:
@@ -97,7 +99,8 @@ def named(base: Path, stated: str) -> Path | str:
 def is_there(base: Path, stated: str) -> bool:
     """Return True if a source exists; what is stated by URL is fetched."""
     try:
-        return located(base, stated).exists()
+        path = located(base, stated)
+        return path.exists() or is_folder(path)
     except DataError:
         return False
 

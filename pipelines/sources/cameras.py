@@ -16,6 +16,7 @@ from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import CameraSources, FrameTimes, IntrinsicsSource
 from pipelines.session.records import SHARED_SECONDS, UNTIMED, Detections, VideoIndex
+from pipelines.session.storage import is_folder
 from pipelines.session.urls import media_path
 from pipelines.sources.files import FlightFiles
 from pipelines.sources.logs import FlightLogs, Frames
@@ -73,6 +74,8 @@ class FlightCameras:
         if camera.video is not None and self._files.is_log("video", camera.video):
             logged = self._logs.frames(camera.video.file, camera.video.topic)
         pictures = _pictures(video, logged)
+        for line in video.notes if video is not None else ():
+            self._note(f"{name}: {line}")
         if times.fps is not None:
             taken = np.arange(len(pictures.t_ns) if pictures else self._listed_frames(camera, detections))
             if video is not None:
@@ -102,8 +105,6 @@ class FlightCameras:
             )
             remedy = "write frame_times: {start: SECONDS, fps: 30}, or give a csv"
             raise DataError(self._manifest, problem, remedy, code="clock-unknown")
-        for line in video.notes if video is not None else ():
-            self._note(f"{name}: {line}")
         if video is not None and video.codec == SHARED_SECONDS and camera.clock is None:
             self._note(
                 f"{name}: several of its pictures share a second in EXIF and are spread evenly over it: say"
@@ -151,7 +152,7 @@ class FlightCameras:
             problem = "does not say when it was made"
             remedy = f"write frame_times: {{start: SECONDS}} for camera {name}"
             raise DataError(path or self._manifest, problem, remedy, code="clock-unknown")
-        if camera.clock is None and path is not None and not path.is_dir():
+        if camera.clock is None and path is not None and not is_folder(path):
             self._note(
                 f"{name}: its video says that it was made at {made_ns / 1e9:.0f} s, to a second at best:"
                 " say clock: {sigma_s: 1}"
@@ -219,7 +220,7 @@ class FlightCameras:
         if size := self._picture_size(camera, video, detections):
             bars = (0, 0, 0, 0)
             file = self._files.video_file(camera)
-            if file is not None and not file.is_dir() and not is_resized(intrinsics, *size):
+            if file is not None and not is_folder(file) and not is_resized(intrinsics, *size):
                 bars = black_bars(file)
             try:
                 intrinsics, note = fit_to_size(intrinsics, *size, bars)
@@ -267,7 +268,7 @@ def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames |
 
 
 def _made_ns(path: Path) -> int | None:
-    if not path.is_dir():
+    if not is_folder(path):
         return created_ns(path)
     times, _ = taken_ns(path)
     return None if times is None else int(times[0])

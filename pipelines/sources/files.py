@@ -42,7 +42,7 @@ from pipelines.session.registries import (
     TriggerFormat,
     VideoFormat,
 )
-from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
+from pipelines.session.storage import file_stamp, hash_of, is_folder, refuse_special, sha256_of
 from pipelines.session.urls import fetched, located, named, source_url
 from pipelines.session.yaml_models import YamlModel
 from pipelines.sources.world import UP_ROWS, losses
@@ -83,7 +83,7 @@ class FlightFiles:
     def path(self, file: str) -> Path:
         """Return the path of a `file:`, the first one of a split log."""
         path = located(self._base, self._flight.paths_of(file)[0])
-        if self._flight.logs and file not in self._flight.logs and not path.exists():
+        if self._flight.logs and file not in self._flight.logs and not (path.exists() or is_folder(path)):
             remedy = f"check the path, or name one of the logs {', '.join(self._flight.logs)}"
             raise DataError(path, "does not exist", remedy, code="no-such-file")
         return path

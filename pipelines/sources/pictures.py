@@ -17,7 +17,7 @@ from pipelines.session.recognition import recognise
 from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log, LogFormat
 from pipelines.session.stages import noted_stamps
-from pipelines.session.storage import file_stamp, sha256_of
+from pipelines.session.storage import file_stamp, is_folder, sha256_of
 from pipelines.session.urls import located
 
 
@@ -49,7 +49,7 @@ def open_files(paths: list[Path], topic: str | None, stamps: str) -> CameraPictu
     """Open a video, a folder of pictures, or the pictures in a topic of a log."""
     if topic is not None:
         return LoggedPictures(paths, topic, stamps)
-    return FolderPictures(paths[0]) if paths[0].is_dir() else VideoReader(paths[0])
+    return FolderPictures(paths[0]) if is_folder(paths[0]) else VideoReader(paths[0])
 
 
 def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:
@@ -59,7 +59,7 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
         media = _media(description, camera)
         for stated, source in zip(media.paths, media.sources, strict=True):
             path = located(session, stated).resolve()
-            if not path.exists():
+            if not (path.exists() or is_folder(path)):
                 continue
             stamp = file_stamp(path)
             if stamp != noted.get(source) and _content(path, stamp) != description.sources.get(source):

@@ -17,12 +17,10 @@ from pipelines.session.camera_poses import logged_covariance
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import DERIVED, SKELETONS, get_skeleton, mirrored, true_joints_at, with_derived
-from pipelines.session.recognition import EXPECTED, describe_unknown, recognise
+from pipelines.session.recognition import describe_unknown
 from pipelines.session.records import JointMotion, Trajectory
-from pipelines.session.registries import CalibrationFormat, MapFormat
 from pipelines.survey import survey
 from tests.commands.runner import refused
-from tests.real_data import real_data
 from tests.synthetic.flights import write_flight
 
 
@@ -265,30 +263,6 @@ def test_the_line_names_what_the_file_looks_like(
     assert word in caught.value.problem
     assert caught.value.remedy
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_of_another_kind_is_called_by_its_kind() -> None:
-    path = real_data("maps/pcl_bunny_ascii.pcd")
-    assert recognise(path, MapFormat, "map").name == "pcd"
-    with pytest.raises(DataError) as caught:
-        recognise(path, CalibrationFormat, "calibration")
-    assert "PCD" in caught.value.problem
-    assert "opencv" in caught.value.remedy
-
-
-@pytest.mark.parametrize(
-    ("relative", "word"),
-    [
-        ("calib/colmap_maupertuis_txt/images.txt", "COLMAP"),
-        ("calib/pose2sim_Calib.qca.txt", "Qualisys"),
-        ("logs/ros2/rosbag2_empty_bag/metadata.yaml", "ROS 2"),
-        ("maps/nav2_depot.pgm", "PGM"),
-    ],
-)
-def test_a_part_of_something_larger_leads_to_the_whole(relative: str, word: str) -> None:
-    like = describe_unknown(real_data(relative))
-    assert word in like.problem
-    assert like.remedy not in {"", EXPECTED}
 
 
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])

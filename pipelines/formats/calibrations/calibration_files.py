@@ -584,11 +584,12 @@ _LEAST_FOV_DEG = 0.1
 # Sensors have fewer columns.
 _MOST_COLUMNS = 100_000
 # What the simulator takes where nothing is stated (its documentation of settings).
+_AIRSIM_KEYS = ("SimMode", "CameraDefaults", "Vehicles")
 _AIRSIM_PICTURE = {"Width": 256, "Height": 144, "FOV_Degrees": 90}
 
 
 def _is_airsim(head: str) -> bool:
-    return '"SettingsVersion"' in head and '"SimMode"' in head
+    return '"SettingsVersion"' in head and any(f'"{key}"' in head for key in _AIRSIM_KEYS)
 
 
 def _read_airsim(path: Path) -> Cameras:

@@ -18,10 +18,11 @@ from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import SHARED_SECONDS, UNTIMED, Telemetry, VideoIndex
 from pipelines.session.registries import TelemetryChoice
+from pipelines.session.storage import files_in, is_folder
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
-# Vehicle, camera and kind of picture, and the time.
-_OF_AIRSIM = re.compile(r"img_(.+)_\d{12,}")
+# Vehicle and camera, kind of picture (0: scene), and the time.
+_OF_AIRSIM = re.compile(r"img_(.+_(\d+))_\d{12,}")
 # Cameras write XMP into the first part of a file of this size.
 _HEAD = 512 * 1024
 # EXIF counts whole seconds.
@@ -57,19 +58,34 @@ class Tags:
 
 
 def picture_files(folder: Path) -> list[Path]:
-    """Return the pictures of a folder in the order of the numbers in their names; empty for other folders.
+    """Return the pictures of a folder or pattern, by the numbers in their names; empty for other folders.
 
-    Pictures must be at least half of its files, so that one picture among logs makes no sequence.
+    Pictures must be at least half of its files, so that one picture among logs makes no sequence. Depth and
+    the like beside the scene of one camera of AirSim are left out.
     """
     try:
-        files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+        files = [path for path in files_in(folder) if not path.name.startswith(".")]
     except OSError:
         return []
     found = [path for path in files if path.suffix.lower() in SUFFIXES]
     if len(found) < 2 or 2 * len(found) < len(files):
         return []
+    scenes = {name for name, kind in cameras_of_airsim(found) if kind == "0"}
+    if len(scenes) == 1:
+        found = [path for path in found if path.name.startswith(f"img_{min(scenes)}_")]
     return sorted(found, key=lambda path: [(int(part), "") if part.isdecimal() else (-1, part)
                                            for part in re.split(r"(\d+)", path.name)])  # fmt: skip
+
+
+def cameras_of_airsim(files: Sequence[Path]) -> set[tuple[str, str]]:
+    """Return vehicle, camera and kind as AirSim names its pictures, and the kind, of all in these files."""
+    return {(match[1], match[2]) for file in files if (match := _OF_AIRSIM.fullmatch(file.stem))}
+
+
+def patterns_of_airsim(folder: Path) -> list[Path]:
+    """Return a pattern for the scene of each camera of AirSim in a folder; empty with less than two."""
+    scenes = sorted(name for name, kind in cameras_of_airsim(files_in(folder)) if kind == "0")
+    return [folder / f"img_{name}_*" for name in scenes] if len(scenes) > 1 else []
 
 
 def read_tags(path: Path) -> Tags:
@@ -171,7 +187,7 @@ class PictureFolder:
 
     def recognises(self, path: Path) -> bool:
         """Return True for a folder with two pictures or more."""
-        return path.is_dir() and bool(picture_files(path))
+        return is_folder(path) and bool(picture_files(path))
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe pictures, times and size."""
@@ -181,6 +197,7 @@ class PictureFolder:
             "times": _SAID.get(index.codec, "EXIF"),
             "span_s": None if index.codec == UNTIMED else index.span_s,
             "picture": f"{index.width} x {index.height} px",
+            **({"notes": list(index.notes)} if index.notes else {}),
         }
 
     def index(self, path: Path) -> VideoIndex:
@@ -191,6 +208,9 @@ class PictureFolder:
         if first is None:
             problem = "has a first picture that cannot be decoded"
             raise DataError(path, problem, "take it out of the folder", code="damaged")
+        kept = cameras_of_airsim(pictures.files)
+        others = sorted(name for name, _ in cameras_of_airsim(files_in(path)) - kept) if kept else []
+        left_out = (f"pictures of AirSim's {', '.join(others)} are left out",) if others else ()
         stamps = times if times is not None else np.arange(len(pictures.files), dtype=np.int64) * 10**9
         return VideoIndex(
             pts_ns=stamps - stamps[0],
@@ -199,6 +219,7 @@ class PictureFolder:
             height=first.shape[0],
             rotation_deg=0,
             codec=UNTIMED if times is None else SHARED_SECONDS if shared else "pictures",
+            notes=left_out,
         )
 
 
@@ -216,10 +237,10 @@ class FolderPictures:
         if not self.files:
             problem = "is no folder of pictures"
             raise DataError(path, problem, "name the folder that holds them", code="wrong-kind")
-        named = [_OF_AIRSIM.fullmatch(file.stem) for file in self.files]
-        if len(cameras := sorted({match[1] for match in named if match})) > 1:
+        if len(cameras := sorted(name for name, _ in cameras_of_airsim(self.files))) > 1:
             problem = f"holds pictures of {len(cameras)} cameras of AirSim ({', '.join(cameras)})"
-            raise DataError(path, problem, "give each a folder of its own", code="ambiguous")
+            remedy = f"name those of one: video: {path.name}/img_{cameras[0]}_*"
+            raise DataError(path, problem, remedy, code="ambiguous")
         self._size: tuple[int, ...] | None = None
 
     def __enter__(self) -> Self:
@@ -276,7 +297,7 @@ class PictureTags(DroneLog):
 
     def recognises(self, path: Path) -> bool:
         """Return True for a folder of pictures whose first says where it was taken."""
-        files = picture_files(path) if path.is_dir() else []
+        files = picture_files(path) if is_folder(path) else []
         return "latitude" in (read_tags(files[0]) if files else Tags(None)).values
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:

@@ -14,6 +14,7 @@ from pipelines.session.recognition import recognise
 from pipelines.session.records import UNTIMED
 from pipelines.session.registries import TelemetryChoice, VideoFormat
 from tests.commands.runner import succeeds
+from tests.raising import refused
 
 READER: VideoFormat = picture_folder.PICTURES
 TAGS = picture_folder.PICTURE_TAGS
@@ -145,3 +146,29 @@ def test_pictures_of_one_second_are_spread_over_it(seconds: list[int], expected:
     assert shared is (expected != seconds)
     fine, shared = picture_times([Tags(4 * S_NS), Tags(4 * S_NS + 1), Tags(4 * S_NS + 1)])
     assert (fine[-1] - fine[0], shared) == (1, False)
+
+
+def test_several_cameras_of_airsim_in_one_folder(tmp_path: Path) -> None:
+    rows = ["VehicleName TimeStamp POS_X POS_Y POS_Z Q_W Q_X Q_Y Q_Z ImageFile".replace(" ", "\t")]
+    (tmp_path / "images").mkdir()
+    for k in range(5):
+        for vehicle in ("Drone1", "Drone2"):
+            t_ms = START_NS // 10**6 + 100 * k
+            for kind in (0, 5):  # the scene, and its segmentation
+                picture = Image.new("RGB", (64, 48), (40 * k, 9 * kind, 0))
+                picture.save(tmp_path / "images" / f"img_{vehicle}_0_{kind}_{t_ms * 10**6 + kind}.png")
+            rows.append(f"{vehicle}\t{t_ms}\t{k}\t0\t-5\t1\t0\t0\t0\tx.png")
+    (tmp_path / "airsim_rec.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    with refused("ambiguous", tmp_path / "images"):
+        READER.index(tmp_path / "images")
+    lens = '{"CaptureSettings": [{"ImageType": 0, "Width": 64, "Height": 48}]}'
+    lens = f'{{"SettingsVersion": 1.2, "SimMode": "Multirotor", "CameraDefaults": {lens}}}'
+    (tmp_path / "settings.json").write_text(lens, encoding="utf-8")
+    succeeds("init", tmp_path)
+    succeeds("ingest", tmp_path / "flight.yaml")
+    for camera in ("Drone1", "Drone2"):
+        frames = pd.read_parquet(tmp_path / "flight.session" / "cameras" / camera / "frames.parquet")
+        assert (frames["t_ns"] - START_NS // 10**6 * 10**6).tolist() == [k * 10**8 for k in range(5)]
+    for path in (tmp_path / "images").glob("img_Drone2*"):
+        path.unlink()
+    assert READER.index(tmp_path / "images").count == 5
