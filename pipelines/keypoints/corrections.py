@@ -399,13 +399,11 @@ class Calibration:
 
     Each was fitted on keypoints whose error is known (rendered flights) by isotonic regression (Zadrozny and
     Elkan, "Transforming Classifier Scores into Accurate Multiclass Probability Estimates", 2002);
-    `tools/detector_errors.py` measures it, `origin` is its command and data, `good` the definition of a good
-    joint. `knots` are, for each group, [K, 3] confidence (rising), probability (not falling) and count of
-    keypoints. A group is a part of joints' names (`wrist`); `*` is for those of no group.
+    `tools/detector_errors.py` measures it; the table begins with its command and what a good joint is.
+    `knots` are, for each group, [K, 3] confidence (rising), probability (not falling) and count of keypoints.
+    A group is a part of joints' names (`wrist`); `*` is for those of no group.
     """
 
-    origin: str
-    good: str
     knots: Mapping[str, Float]
 
     def probability(self, confidence: Float, joints: Sequence[str]) -> Float:
@@ -444,9 +442,9 @@ def group_of(joint: str, groups: Mapping[str, object]) -> str:
 
 def read_calibration(path: Path) -> Calibration:
     """Read a table of this package."""
-    made_by, good, *lines = path.read_text(encoding="utf-8").splitlines()
+    _, _, _, *lines = path.read_text(encoding="utf-8").splitlines()
     table: dict[str, list[list[float]]] = {}
-    for group, *numbers in csv.reader(lines[1:]):
+    for group, *numbers in csv.reader(lines):
         table.setdefault(group, []).append([float(number) for number in numbers])
     knots = {group: np.array(own) for group, own in table.items()}
-    return Calibration(made_by.removeprefix("# made by: "), good.partition("a joint is ")[2], knots)
+    return Calibration(knots)

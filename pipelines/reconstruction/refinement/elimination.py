@@ -58,7 +58,6 @@ class Eliminated:
     factors: dict[int, Factors]  # of the segments whose factors are kept
     lower: Float  # Cholesky factor of the remaining equations
     gradient: Float  # of the same
-    log_determinant: float  # half the log determinant of all equations, white errors included
 
 
 def eliminate(system: System, state: State) -> Eliminated:
@@ -67,20 +66,18 @@ def eliminate(system: System, state: State) -> Eliminated:
 
     n, front = 3 * system.problem.joints, _begin(system, state)
     fronts, kept = [], {}
-    half_log, segments = 0.0, _segments(system)
+    segments = _segments(system)
     kept_times = _KEPT_BYTES / (8 * n * system.size)
     for index, (first, last) in enumerate(segments):
         fronts.append(front.packed())
-        factors, part = _eliminate(system, state, front, first, last)
-        half_log += part
+        factors = _eliminate(system, state, front, first, last)
         if last < kept_times or index == len(segments) - 1:
             kept[index] = factors
     alive = np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
     lower, failed = dpotrf(front.matrix[np.ix_(alive, alive)], lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("the equations of what all times share are singular")
-    half_log += float(np.log(np.diagonal(lower)).sum())
-    return Eliminated(state, fronts, kept, lower, front.gradient[alive], half_log)
+    return Eliminated(state, fronts, kept, lower, front.gradient[alive])
 
 
 def step(system: System, at: Eliminated) -> State:
@@ -190,7 +187,7 @@ def _sweep(system: System, state: State) -> Sweep:
     )
 
 
-def _eliminate(system: System, state: State, front: _Front, first: int, last: int) -> tuple[Factors, float]:
+def _eliminate(system: System, state: State, front: _Front, first: int, last: int) -> Factors:
     """Eliminate the knots and joints of times from `first` to before `last`; change the front in place."""
     n, c = 3 * system.problem.joints, system.layout.entries.knot_count
     times, size = last - first, system.size
@@ -205,12 +202,12 @@ def _eliminate(system: System, state: State, front: _Front, first: int, last: in
         np.zeros((knots, c)),
     )
     try:
-        front.interval, log_determinant = forwards(
+        front.interval = forwards(
             first, last, _sweep(system, state), front.matrix, front.gradient, front.interval, factors
         )
     except np.linalg.LinAlgError as error:
         raise np.linalg.LinAlgError("the equations of the refinement are singular") from error
-    return factors, log_determinant
+    return factors
 
 
 def _last_covariance(at: Eliminated) -> Float:
@@ -225,7 +222,7 @@ def _factors_backwards(system: System, at: Eliminated) -> Iterator[tuple[int, in
     for index, segment in reversed(list(enumerate(_segments(system)))):
         factors = at.factors.get(index)
         if factors is None:
-            factors, _ = _eliminate(system, at.state, at.fronts[index].unpacked(), *segment)
+            factors = _eliminate(system, at.state, at.fronts[index].unpacked(), *segment)
         yield *segment, factors
 
 
@@ -321,13 +318,11 @@ def lower_square(rows: Float) -> Float:
 @helper
 def eliminate_block(
     own: Float, beside: Float, gradient: Float, inverse: Float, across: Float, y: Float
-) -> tuple[Float, float]:
-    """Compute R = L^-1, W = B R', y = -R g in place; return W W' (lower) and half log det of `own`."""
+) -> Float:
+    """Compute R = L^-1, W = B R', y = -R g in place; return W W' (lower)."""
     n = len(own)
     lower = np.linalg.cholesky(own)
-    half = 0.0
     for i in range(n):
-        half += np.log(lower[i, i])
         for j in range(i + 1):
             inverse[i, j] = 0.0
         for j in range(i + 1, n):
@@ -345,14 +340,14 @@ def eliminate_block(
             total -= inverse[i, j] * gradient[j]
         y[i] = total
     np.dot(beside, inverse.T, across)
-    return lower_square(across), half
+    return lower_square(across)
 
 
 @cached
 def forwards(
     first: int, last: int, sweep: Sweep, front: Float, gradient: Float, interval: int, factors: Factors
-) -> tuple[int, float]:
-    """Eliminate the times from `first` to before `last`; return the last's interval, and half the log det."""
+) -> int:
+    """Eliminate the times from `first` to before `last`; return the last's interval."""
     position, shared = sweep.equations.state.position, sweep.equations.state.shared
     knots, bones = sweep.equations.state.knots, sweep.bones
     starts, of_time, grown = sweep.starts, sweep.of_time, sweep.grown
@@ -363,7 +358,6 @@ def forwards(
     s = size - 3 * n - 2 * c
     lengths = shared[len(shared) - len(bones) :]
     length_offset = size - len(bones)
-    half = 0.0
     if c and first == 0:
         tie_knots(front, gradient, n, c, knots, 0, sweep)
     own, beside = np.empty((n, n)), np.empty((size - n, n))
@@ -371,7 +365,7 @@ def forwards(
     for time in range(first, last + 1):
         while c and interval < of_time[time]:
             k = interval - factors.first_interval
-            half += eliminate_knot(
+            eliminate_knot(
                 front, gradient, n, c, knot_own, knot_beside, factors.knot_inverse[k],
                 factors.knot_across[k], factors.knot_solved[k],
             )  # fmt: skip
@@ -379,7 +373,7 @@ def forwards(
             tie_knots(front, gradient, n, c, knots, interval, sweep)
         if time == last:
             break
-        half += assemble(starts[time], starts[time + 1], sweep.equations, front, gradient)
+        assemble(starts[time], starts[time + 1], sweep.equations, front, gradient)
         add_motion(
             position[time : time + 3], sweep.curvature[time], sweep.precision,
             1.0 / (sweep.spread[time] * grown**2), sweep.hold, lengths, length_offset, front, gradient,
@@ -394,8 +388,7 @@ def forwards(
         copy_block(front, n, 0, beside)
         row = time - first
         w = across[row]
-        less, part = eliminate_block(own, beside, gradient[:n], inverse[row], w, solved[row])
-        half += part
+        less = eliminate_block(own, beside, gradient[:n], inverse[row], w, solved[row])
         # The joints at the next two times move up; those of a third enter without any information.
         for i in range(2 * n):
             down = 0.0
@@ -419,7 +412,7 @@ def forwards(
                 front[i, j] = 0.0
             for j in range(3 * n, i + 1):
                 front[i, j] -= less[i - n, j - n]
-    return interval, half
+    return interval
 
 
 @helper
@@ -433,7 +426,7 @@ def eliminate_knot(
     inverse: Float,
     across: Float,
     solved: Float,
-) -> float:
+) -> None:
     """Eliminate the knot before; the knot after takes its place, and the next enters without information."""
     size = len(gradient)
     before, after = 3 * n, 3 * n + c
@@ -443,7 +436,7 @@ def eliminate_knot(
             beside[j, i] = front[before + i, j]
         for j in range(after, size):
             beside[2 * n + j - after, i] = front[j, before + i]
-    less, half = eliminate_block(own, beside, gradient[before:after], inverse, across, solved)
+    less = eliminate_block(own, beside, gradient[before:after], inverse, across, solved)
     for i in range(2 * n):
         for a in range(c):
             gradient[i] += across[i, a] * solved[a]
@@ -475,7 +468,6 @@ def eliminate_knot(
         for j in range(c):
             front[i, before + j] = front[i, after + j]
             front[i, after + j] = 0.0
-    return half
 
 
 @helper

@@ -405,10 +405,8 @@ def normal_equations(
 @helper
 def assemble(
     first_picture: int, last_picture: int, equations: Equations, front: Float, gradient: Float
-) -> float:
-    """Add pictures with the same three times to the front.
-
-    Returns half the logarithm of the determinant of the white errors' equations, which are eliminated.
+) -> None:
+    """Add pictures with the same three times to the front; their white errors are eliminated.
 
     The front's unknowns are the joints at three times, the knots on both sides of the interval, and the
     shared unknowns; only its lower triangle is kept.
@@ -427,7 +425,6 @@ def assemble(
     by_both = np.empty((n, n))  # what the white errors take from each pair of coordinates
     most = 2 * (entries.column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
-    half = 0.0
     for g in range(first_picture, last_picture):
         linearise_picture(g, t_s, state, pictures, entries, picture)
         weigh(picture.residual, bound2, picture.view_weight)
@@ -445,8 +442,6 @@ def assemble(
                 for b in range(NUMBERS):
                     by_white[n + b, a] = of_numbers[b, a]
             factorise(factor)
-            for a in range(WHITE):
-                half += np.log(factor[a, a])
             for line in range(len(by_white)):
                 forward(factor, by_white[line])
             for p in range(n):
@@ -502,7 +497,6 @@ def assemble(
                     for i in range(WHITE):
                         total -= by_white[n + a, i] * by_white[n + b, i]
                     front[column[e], column[f]] += share[e] * share[f] * total
-    return half
 
 
 @cached
