@@ -144,11 +144,11 @@ class Pilot:
         """Return commanded slots [T, N, 3], yaw from east, and the places [N, T, 3] that cameras aim at."""
         return self._formation.at(t_s), self._aimed(t_s)
 
-    def reference(self, t_s: float) -> tuple[Float, Float, Float]:
-        """Return position, velocity, acceleration [N, 3] of the latest local plans, after `replan`."""
-        asked = [plan.at(np.array([t_s])) for plan in self._plans if plan is not None]
-        where, speed, change = (np.concatenate(part) for part in zip(*asked, strict=True))
-        return where, speed, change
+    def reference(self, t_s: float) -> tuple[Float, Float]:
+        """Return position and velocity [N, 3] of the latest local plans, after `replan`."""
+        asked = [plan.at(np.array([t_s]))[:2] for plan in self._plans if plan is not None]
+        where, speed = (np.concatenate(part) for part in zip(*asked, strict=True))
+        return where, speed
 
     def _aimed(self, t_s: Float) -> Float:
         """Return the places [N, T, 3] that cameras film, and about which their slots are."""
