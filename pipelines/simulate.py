@@ -196,8 +196,7 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
             if not measured:  # the actor's position is not known yet: hover
                 return known.position, np.zeros_like(known.position)
             pilot.replan(known.t_s, known.position, known.velocity, field)
-            position, velocity = pilot.reference(known.t_s)
-            return position, velocity
+            return pilot.reference(known.t_s)
 
         return slots
 

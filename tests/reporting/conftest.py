@@ -1,9 +1,12 @@
 """A session in closed form: an actor on a circle, three cameras, known shares of every status."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.geometry.arrays import Intrinsics
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import SessionContent
 from pipelines.session.description import Description
@@ -14,37 +17,23 @@ FRAMES = 600
 RATE_HZ = 30
 CAMERAS = ("drone1", "drone2", "mast")
 # Forward, left and up of every joint in metres, a person standing upright at the origin.
-STANDING = {
-    "nose": (0.10, 0.0, 1.65),
-    "left_eye": (0.09, 0.03, 1.68),
-    "right_eye": (0.09, -0.03, 1.68),
-    "left_ear": (0.0, 0.07, 1.67),
-    "right_ear": (0.0, -0.07, 1.67),
-    "left_shoulder": (0.0, 0.19, 1.45),
-    "right_shoulder": (0.0, -0.19, 1.45),
-    "left_elbow": (0.0, 0.23, 1.17),
-    "right_elbow": (0.0, -0.23, 1.17),
-    "left_wrist": (0.05, 0.24, 0.92),
-    "right_wrist": (0.05, -0.24, 0.92),
-    "left_hip": (0.0, 0.13, 0.93),
-    "right_hip": (0.0, -0.13, 0.93),
-    "left_knee": (0.02, 0.12, 0.50),
-    "right_knee": (0.02, -0.12, 0.50),
-    "left_ankle": (0.0, 0.12, 0.08),
-    "right_ankle": (0.0, -0.12, 0.08),
+_SIDED = {
+    "eye": (0.09, 0.03, 1.68),
+    "ear": (0.0, 0.07, 1.67),
+    "shoulder": (0.0, 0.19, 1.45),
+    "elbow": (0.0, 0.23, 1.17),
+    "wrist": (0.05, 0.24, 0.92),
+    "hip": (0.0, 0.13, 0.93),
+    "knee": (0.02, 0.12, 0.50),
+    "ankle": (0.0, 0.12, 0.08),
+}
+STANDING = {"nose": (0.10, 0.0, 1.65)} | {
+    f"{side}_{name}": (x, y if side == "left" else -y, z)
+    for name, (x, y, z) in _SIDED.items()
+    for side in ("left", "right")
 }
 JOINTS = tuple(STANDING)
-INTRINSICS = {
-    "width": 1920,
-    "height": 1080,
-    "fx": 1400.0,
-    "fy": 1400.0,
-    "cx": 959.5,
-    "cy": 539.5,
-    "model": "none",
-    "distortion": [],
-    "readout_s": 0.0,
-}
+INTRINSICS = asdict(Intrinsics(1920, 1080, 1400.0, 1400.0, 959.5, 539.5))
 OFFSET_M = np.array([0.02, 0.0, 0.01])
 """Error of the skeleton at every joint and time: sqrt(500) mm = 22.36 mm."""
 ASIDE_PX = np.array([3.0, -4.0])

@@ -13,6 +13,7 @@ from tests.simulation.motion.performing import RIG, clearance_m, flat, mound, pe
 
 OURS = ("pelvis", "spine", "back", "chest", "neck", "head")
 SIDED = ("clavicle", "upper_arm", "forearm", "hand", "thigh", "shank", "foot", "toes")
+MAKEHUMAN = ("upperarm01", "lowerarm01", "wrist", "upperleg01", "lowerleg01", "foot")
 NAMES = {  # the trunk upwards, then the bones of a side with * for it; what stands for left and right
     "mixamo": (
         ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"],
@@ -26,16 +27,7 @@ NAMES = {  # the trunk upwards, then the bones of a side with * for it; what sta
     ),
     "makehuman": (
         ["root", "spine05", "spine03", "spine01", "neck01", "head"],
-        [
-            "clavicle.*",
-            "upperarm01.*",
-            "lowerarm01.*",
-            "wrist.*",
-            "upperleg01.*",
-            "lowerleg01.*",
-            "foot.*",
-            "toe1-1.*",
-        ],
+        ["clavicle.*", *(f"{bone}.*" for bone in MAKEHUMAN), "toe1-1.*"],
         ("L", "R"),
     ),
     "joints": (
