@@ -96,7 +96,7 @@ from pipelines.reconstruction.results import (
     gait_of,
     method_used,
     of_people,
-    other_axes_of_truth,
+    other_place_of_truth,
     people_warnings,
     skeleton_parts,
     summary_of_trials,
@@ -608,7 +608,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     people = _people_seen(description, names, seen.association, doubted)
     unseen = [description.names_of_people(k + 1)[k] for k in seen.association.unseen]
     metrics |= of_people(people["names"], observations, result, truth)
-    other_axes = other_axes_of_truth(observations, result, truth)
+    other_place = other_place_of_truth(observations, result, truth)
     readout = {
         camera.name: readout_of(camera, seen.found, c, seen.association.choice[:, c])
         for c, camera in enumerate(cameras)
@@ -636,7 +636,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         _poses_stored(cameras, refined, background["background"], flight.between),
         [
             *warnings,
-            *([other_axes] if other_axes else []),
+            *([other_place] if other_place else []),
             *(refined.warnings if refined else []),
             *seen.association.reasons,
             *(f"nobody is seen near the log of {name}" for name in unseen),

@@ -180,7 +180,7 @@ def _summed(residual: Float) -> Series:
     return np.where(there, residual, 0.0).sum(axis=axes), there.sum(axis=axes, dtype=np.float64)
 
 
-# Other axes are looked for above this error of a truth, and named where they make it smaller than this share.
+# Other places and axes of a truth are named above this error, where they make it smaller than this share.
 _LEAST_OF_AXES_MM, _SHARE_OF_AXES = 300.0, 0.2
 # So many moments of a flight tell the axes of its truth.
 _MOMENTS_OF_AXES = 100
@@ -193,8 +193,10 @@ _KEYS_OF_AXES = {
 }
 
 
-def other_axes_of_truth(observations: Observations, result: Triangulation, truth: Float | None) -> str | None:
-    """Return a warning if a right-angled turn of the truth [T, P', J, 3] takes its error away."""
+def other_place_of_truth(
+    observations: Observations, result: Triangulation, truth: Float | None
+) -> str | None:
+    """Return a warning if a shift or right-angled turn of the truth [T, P', J, 3] takes its error away."""
     if truth is None:
         return None
     shape = observations.confidence.shape[:3]
@@ -202,12 +204,23 @@ def other_axes_of_truth(observations: Observations, result: Triangulation, truth
     some = slice(None, None, len(ok) // _MOMENTS_OF_AXES + 1)
     position = np.where(ok[..., None], result.points.reshape(*shape, 3), np.nan)[some]
 
+    def apart_m(turn: Float) -> Float:
+        return position - own_truth(position, truth[some] @ turn.T)
+
     def error_mm(turn: Float) -> float:
-        return _mean_mm(position - own_truth(position, truth[some] @ turn.T)) or 0.0
+        return _mean_mm(apart_m(turn)) or 0.0
 
     stated_mm = error_mm(np.eye(3))
     if stated_mm < _LEAST_OF_AXES_MM:
         return None
+    shift = np.nanmean(apart_m(np.eye(3)), axis=(0, 1, 2))
+    placed_mm = _mean_mm(apart_m(np.eye(3)) - shift) or 0.0
+    if placed_mm < _SHARE_OF_AXES * stated_mm:
+        far = ", ".join(f"{metres:+.2f}" for metres in shift)
+        return (
+            f"only the place is not the truth's: the error is {stated_mm:.0f} mm, and {placed_mm:.0f} mm"
+            f" after one shift of the whole flight by {far} m"
+        )
     signed = (
         np.diag(signs)[list(order)].astype(float)
         for order in permutations(range(3))

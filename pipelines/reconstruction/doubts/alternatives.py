@@ -291,7 +291,9 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
     price = PRICE_OF_ALL + np.log(1 / STATURE_SHARE) / 2 + dearer
     size = STATURE_M / stature
     by_actor, sigma = _scaled_to_actor(trial, joints, size)
-    unit = next((name for name, m in _UNITS_M.items() if abs(np.log(by_actor / m)) < STATURE_SHARE), None)
+    # Units are far apart, so nearly all statures tell them.
+    near = max(2 * sigma, STATURE_SHARE)
+    unit = next((name for name, m in _UNITS_M.items() if abs(np.log(by_actor / m)) < near), None)
     alone = unit is not None
     if flight.truth_m is not None:
         alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
@@ -794,6 +796,7 @@ def larger_errors(trial: Trial) -> Iterator[list[Alternative]]:
     groups += [[index] for index in trial.moving] if len(trial.names) > 2 else []  # of two, either errs more
     for group in groups if trial.moving else ():
         whose = "" if len(group) == len(trial.names) else f" of {trial.names[group[0]]}"
+        stated = "stated" if trial.cameras[group[0]].states_noise else "usual"
         tried = []
         for factor in _NOISE_FACTORS:
             sigma = trial.described.sigma.copy()
@@ -802,7 +805,7 @@ def larger_errors(trial: Trial) -> Iterator[list[Alternative]]:
                 Alternative(
                     "pose" if whose else "noise",
                     trial.named(group),
-                    f"errors of the poses{whose} are larger than stated, about {factor:g} times",
+                    f"errors of the poses{whose} are larger than {stated}, about {factor:g} times",
                     remedies.pose_noise(trial.cameras, group, factor),
                     np.inf,
                     replace(trial.described, sigma=sigma),
