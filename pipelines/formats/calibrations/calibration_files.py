@@ -583,8 +583,9 @@ KALIBR = CalibrationFile(
 _LEAST_FOV_DEG = 0.1
 # Sensors have fewer columns.
 _MOST_COLUMNS = 100_000
-# What the simulator takes where nothing is stated (its documentation of settings).
+# Settings hold one of these at least.
 _AIRSIM_KEYS = ("SimMode", "CameraDefaults", "Vehicles")
+# What the simulator takes where nothing is stated (its documentation of settings).
 _AIRSIM_PICTURE = {"Width": 256, "Height": 144, "FOV_Degrees": 90}
 
 

@@ -236,8 +236,16 @@ _MOST_CELLS_PER_ROW = 100
 LEAST_JOINTS_OF_WIDE = 4
 # The column of frame numbers of caliscope, and of other programs.
 _FRAME_NAMES = ("sync_index", "frame")
-# FreeMoCap's table of all points has these columns.
+# Tables of all points of FreeMoCap and of caliscope have these columns.
 _FREEMOCAP = {"frame", "model", "keypoint", "x", "y", "z"}
+_CALISCOPE = {"sync_index", "point_id", "x_coord", "y_coord", "z_coord"}
+# Caliscope's files are named by the tracker, which numbers the points of the body so.
+_TRACKERS_OF_CALISCOPE = {
+    "halpe26": "halpe26",
+    "wholebody": "coco23",
+    "holistic": "blazepose33",
+    "xyz_pose": "blazepose33",
+}
 
 
 @dataclass(frozen=True)
@@ -259,13 +267,13 @@ def _read_csv(path: Path, unit: str | None, axes: str | None) -> JointMotion:
     """Read the header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
 
     Tables with a row for each time are read, too: time, nose_x, nose_y, nose_z, ... (FreeMoCap, caliscope),
-    and FreeMoCap's with a row for each frame and keypoint, in mm. Without a time their frames are counted.
+    and theirs with a row for each frame and point (FreeMoCap's in mm). Frames without times are counted.
     Metres and z up unless the user states otherwise. Rows of single joints may come in any order; people are
     ranked by their number. A position that is blank, infinite or absent is missing (NaN).
     """
     text = read_text(path)
-    if _is_freemocap(text):
-        return _read_freemocap(path, text, unit or "mm", axes or "z-up")
+    if _is_long(text):
+        return _read_long(path, text, unit, axes or "z-up")
     heading = _find_heading(text)
     if heading is None and (columns := _joints_of_wide(text)):
         return _read_wide(path, text, columns, unit or "m", axes or "z-up")
@@ -323,30 +331,48 @@ def _read_wide(path: Path, text: str, columns: dict[str, int], unit: str, axes: 
     return JointMotion(stamps, joint_names(tuple(columns)), position[:, None], timed=timed is not None)
 
 
-def _is_freemocap(text: str) -> bool:
-    return {cell_name(cell)[0] for cell in text.split("\n", 1)[0].split(",")} >= _FREEMOCAP
+def _columns(text: str) -> set[str]:
+    return {cell_name(cell)[0] for cell in text.split("\n", 1)[0].split(",")}
 
 
-def _read_freemocap(path: Path, text: str, unit: str, axes: str) -> JointMotion:
-    """Read the keypoints of the body; hands, face, centres of mass and rigid bodies are left out."""
+def _is_long(text: str) -> bool:
+    return any(_columns(text) >= known for known in (_FREEMOCAP, _CALISCOPE))
+
+
+def _read_long(path: Path, text: str, unit: str | None, axes: str) -> JointMotion:
+    """Read a row for each frame and point; hands, face, centres of mass and rigid bodies are left out."""
     try:
         table = pd.read_csv(StringIO(text), dtype=str, keep_default_na=False)
     except ValueError as error:
         raise damaged(path, error) from error
-    is_body = table["model"].str.contains("body")
-    if "trajectory" in table:
-        is_body &= table["trajectory"] == "3d_xyz"
-    table = table[is_body]
-    numbers = table[["frame", *"xyz"]].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+    if _columns(text) >= _CALISCOPE:
+        table["keypoint"] = table["point_id"].map(_points_of_caliscope(path))
+        table = table[table["keypoint"].notna()]
+        columns, unit = ["sync_index", "x_coord", "y_coord", "z_coord"], unit or "m"
+    else:
+        is_body = table["model"].str.contains("body")
+        if "trajectory" in table:
+            is_body &= table["trajectory"] == "3d_xyz"
+        table, columns, unit = table[is_body], ["frame", *"xyz"], unit or "mm"
+    numbers = table[columns].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
     if not len(table) or not (np.abs(numbers[:, 0]) < _MOST_FRAMES).all():
         raise damaged(path, "has no keypoint of a body, or rows without a frame")
     position = to_metres_z_up(path, numbers[:, 1:], unit, axes)
-    t_ns, names = (
-        np.rint(numbers[:, 0] * 1e9).astype(np.int64),
-        pa.chunked_array([table["keypoint"].tolist()]),
-    )
+    t_ns = np.rint(numbers[:, 0] * 1e9).astype(np.int64)
+    names = pa.chunked_array([table["keypoint"].tolist()])
     motion = _dense(path, t_ns, np.zeros(len(t_ns), np.int64), names, position)
     return replace(motion, joints=joint_names(motion.joints), timed=False)
+
+
+def _points_of_caliscope(path: Path) -> dict[str, str]:
+    """Return the names of points by their numbers, which depend on the tracker in the file's name."""
+    tracker = path.stem.lower()
+    skeleton = next((name for word, name in _TRACKERS_OF_CALISCOPE.items() if word in tracker), None)
+    if skeleton is None:
+        problem = "numbers its points, and its name tells no tracker whose numbers are known"
+        raise DataError(path, problem, f"name {path.stem}_labelled.csv beside it", code="no-such-name")
+    names = {str(number): joint for number, joint in enumerate(SKELETONS[skeleton].joints)}
+    return names | ({"100": "right_wrist", "200": "left_wrist"} if "simple" in tracker else {})
 
 
 def _find_heading(text: str) -> Heading | None:
@@ -511,7 +537,7 @@ JOINTS_CSV = JointFile(
     (".csv", ".txt"),
     lambda head: (
         _find_heading(head) is not None
-        or _is_freemocap(head)
+        or _is_long(head)
         or len(_joints_of_wide(head)) >= LEAST_JOINTS_OF_WIDE
     ),
     _read_csv,

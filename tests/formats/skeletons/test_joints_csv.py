@@ -136,6 +136,28 @@ def test_a_row_for_each_time_as_freemocap_writes_them(tmp_path: Path) -> None:
         [0, 10**9],
     )
     np.testing.assert_allclose(frames.position[1, 0], [[0.001, 0.002, 0.007]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("tracker", "numbered"),
+    [
+        ("POSE", {0: "nose", 24: "right_hip", 31: "left_big_toe"}),
+        ("SIMPLE_HOLISTIC", {11: "left_shoulder", 100: "right_wrist", 101: None, 504: None}),
+        ("RTMPose-m Halpe26", {0: "nose", 19: "hip", 20: "left_big_toe"}),
+    ],
+)
+def test_numbered_points_of_caliscope(tmp_path: Path, tracker: str, numbered: dict[int, str | None]) -> None:
+    rows = [f"{frame},{point},{point},{frame},2,\n" for frame in (3, 4) for point in numbered]
+    path = tmp_path / f"xyz_{tracker}.csv"
+    path.write_text("sync_index,point_id,x_coord,y_coord,z_coord,frame_time\n" + "".join(rows))
+    assert [each.name for each in FORMATS.all() if each.recognises(path)] == ["joints_csv"]
+    motion = read(path)
+    assert (motion.joints, motion.timed) == (tuple(filter(None, numbered.values())), False)
+    assert motion.t_ns.tolist() == [3 * 10**9, 4 * 10**9]
+    assert motion.position[1, 0, 0].tolist() == [min(numbered), 4, 2]
+    unknown = path.rename(tmp_path / "xyz_CHARUCO.csv")
+    with refused("no-such-name", unknown, "xyz_CHARUCO_labelled.csv"):
+        read(unknown)
     np.save(tmp_path / "skeleton_3d.npy", np.zeros((4, 33, 3)))
     with refused("wrong-kind", tmp_path / "skeleton_3d.npy", "NumPy"):
         recognise(tmp_path / "skeleton_3d.npy", JointFormat, "joint file")
