@@ -1,4 +1,4 @@
-"""C3D, the format of biomechanics laboratories: 3D points at a constant rate, in 32-bit floats. Needs ezc3d.
+"""C3D, the format of biomechanics laboratories: 3D points at a constant rate; ezc3d writes it.
 
 A missing point has the residual -1; any other residual is here the standard deviation per axis in whole
 millimetres up to 255. Header and POINT:FRAMES count to 65535; larger numbers are in TRIAL:ACTUAL_END_FIELD
@@ -7,9 +7,9 @@ frame in MOCAP:FIRST_T_NS and LAST_T_NS, as text because C3D's numbers are too s
 """
 
 import math
-import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,6 @@ from pipelines.formats.skeletons.joint_files import (
     to_y_up,
 )
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
 from pipelines.session.storage import as_data_error, damaged
@@ -46,8 +45,10 @@ _LONGEST_LABEL = 30
 _LONGEST_TEXT = 255
 # Residuals are stored in one byte of the scale.
 _MOST_RESIDUAL = 255
-# A larger number of the first frame is damage of the header.
-_MOST_FIRST_FRAME = 1_000_000_000
+# Header and POINT:FRAMES count no further.
+_MOST_COUNTED = 65_535
+# C3D has no parameters of more dimensions.
+_MOST_DIMENSIONS = 7
 # Dimensions of a parameter are stored in one byte.
 _MOST_EVENTS = 255
 # Names in gait laboratories' programs.
@@ -70,9 +71,9 @@ class C3dFormat:
         """Describe stated unit, axes and rate, points, times, missing values, and the world box (z up)."""
         contents = _open(path)
         stated: dict[str, object] = {
-            "POINT:UNITS": _text(contents, "POINT", "UNITS"),
-            "POINT:Y_SCREEN": _text(contents, "POINT", "Y_SCREEN"),
-            "POINT:RATE": _number(contents, "POINT", "RATE"),
+            "POINT:UNITS": contents.text("POINT", "UNITS"),
+            "POINT:Y_SCREEN": contents.text("POINT", "Y_SCREEN"),
+            "POINT:RATE": contents.number("POINT", "RATE"),
         }
         known = {key: value for key, value in stated.items() if value is not None}
         return {**known, **describe_motion(_motion(path, contents, unit=None, axes=None))}
@@ -82,18 +83,27 @@ class C3dFormat:
         return _motion(path, _open(path), unit=unit, axes=axes)
 
 
-def _open(path: Path) -> Any:
-    ezc3d = need("ezc3d", "c3d")
-    _check_layout(path)
-    try:
-        return ezc3d.c3d(str(path))
-    except (OSError, ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
-        raise damaged(path, f"is no readable C3D ({str(error)[:120]})") from error
+@dataclass(frozen=True)
+class _Contents:
+    """Parameters by group and name, and the points [T, N, 3] in the file's unit, NaN where missing."""
+
+    parameters: Mapping[tuple[str, str], Sequence[float | str]]
+    points: Float
+    first_frame: int
+
+    def values(self, group: str, name: str) -> Sequence[float | str]:
+        return self.parameters.get((group, name), ())
+
+    def text(self, group: str, name: str) -> str | None:
+        return next((str(value).strip() for value in self.values(group, name)), None)
+
+    def number(self, group: str, name: str) -> float | None:
+        return _number(self.parameters, group, name)
 
 
-def _check_layout(path: Path) -> None:
-    """Refuse a file that is shorter than its header states, or whose parameters overlap."""
+def _open(path: Path) -> _Contents:
     try:
+        size = path.stat().st_size
         with path.open("rb") as file:
             head = file.read(_BLOCK)
             file.seek(max(head[0] - 1, 0) * _BLOCK if head else 0)
@@ -101,126 +111,129 @@ def _check_layout(path: Path) -> None:
             # Some writers do not count the blocks. Then the section ends where the data begin.
             until_data = max(head[16 if section[3] != _MIPS else 17] - head[0], 0) if len(section) > 3 else 0
             section += file.read(max(*section[2:3], until_data, 1) * _BLOCK - _BLOCK)
-            size = file.seek(0, 2)
     except OSError as error:
         raise as_data_error(error, path) from error
     if len(head) < _BLOCK or head[1] != _MAGIC or len(section) < 4:
         raise damaged(path, "is no readable C3D (it ends in its header)")
     processor = section[3]
     order = ">" if processor == _MIPS else "<"
-    points, analogs, first, last = struct.unpack_from(f"{order}4H", head, 2)
-    scale, start = struct.unpack_from(f"{order}fH", head, 12)
-    # DEC stores the half with the sign first.
-    is_float = head[13] & 0x80 if processor == _DEC else scale < 0
-    frames = max(last - first + 1, 0)
-    if stated := re.search(rb"[\x06\xfa].FRAMES..\x02(?:\x00|\x01\x01)(..)", section, re.DOTALL):
-        # Optotrak's headers count wrong; readers go by POINT:FRAMES.
-        frames = min(frames, struct.unpack(f"{order}H", stated[1])[0])
-    needed = (start - 1) * _BLOCK + frames * (4 * points + analogs) * (4 if is_float else 2)
-    if size < needed:
-        raise damaged(path, f"is no readable C3D (it holds {size} of the {needed} bytes of its header)")
-    if not _is_chain(section, order):
-        raise damaged(path, "is no readable C3D (its parameters are damaged)")
-
-
-def _is_chain(section: bytes, order: str) -> bool:
-    """Return True if the parameters follow each other within their section, with consistent lengths."""
-    at, groups = 4, set()
-    wanted: set[int] = set()
     try:
-        while at < len(section) and section[at]:
-            name, group = struct.unpack_from("2b", section, at)
-            step = at + 2 + abs(name)
-            (further,) = struct.unpack_from(f"{order}H", section, step)
-            if group < 0:
-                groups.add(-group)
-                end = step + 3 + section[step + 2]
-            else:
-                wanted.add(group)
-                kind, dimensions = struct.unpack_from("bB", section, step + 2)
-                sides = section[step + 4 : step + 4 + dimensions]
-                end = step + 4 + dimensions + abs(kind) * math.prod(sides)
-                end += 1 + section[end]
-                if kind not in {-1, 1, 2, 4} or dimensions > 7 or len(sides) < dimensions:
-                    return False
-            if end > len(section) or (further and step + further < end):
-                return False
-            if not further:
-                break
-            at = step + further
-            if at > len(section):
-                return False
-    except (IndexError, struct.error):
-        return False
-    return wanted <= groups
+        parameters = _parameters(section, processor, order)
+    except (IndexError, struct.error, ValueError) as error:
+        raise damaged(path, "is no readable C3D (its parameters are damaged)") from error
+    points, analogs, first, last = struct.unpack_from(f"{order}4H", head, 2)
+    start = (struct.unpack_from(f"{order}H", head, 16)[0] - 1) * _BLOCK
+    points = int(_number(parameters, "POINT", "USED") or points) & 0xFFFF
+    scale = _number(parameters, "POINT", "SCALE") or float(_floats(head[12:16], processor, order)[0])
+    kind = np.dtype(f"{order}{'f4' if scale < 0 else 'i2'}")
+    words = 4 * points + analogs
+    # Optotrak's headers count wrong; readers go by POINT:FRAMES.
+    counts = [int(_number(parameters, "POINT", name) or 0) for name in ("LONG_FRAMES", "FRAMES")]
+    counts = [*(count % (_MOST_COUNTED + 1) if count < 0 else count for count in counts), last - first + 1]
+    ends = [_words(parameters.get(("TRIAL", f"ACTUAL_{end}_FIELD"), ())) for end in ("START", "END")]
+    if ends[0] is not None and ends[1] is not None and ends[1] - ends[0] >= _MOST_COUNTED:
+        counts = [ends[1] - ends[0] + 1]
+    held = max(size - start, 0) // max(words * kind.itemsize, 1)
+    frames = next((count for count in counts if 0 < count <= held), 0)
+    if not points or not frames or start < _BLOCK:
+        problem = f"holds {held} of {max(counts)} frames" if points and max(counts) else "holds no points"
+        raise damaged(path, problem)
+    stored = np.fromfile(path, "u1", frames * words * kind.itemsize, offset=start)
+    with np.errstate(invalid="ignore", over="ignore"):  # of damaged numbers
+        values = _floats(stored, processor, order) if scale < 0 else stored.view(kind) * scale
+    rows = values.reshape(frames, words)[:, : 4 * points].reshape(frames, points, 4)
+    return _Contents(parameters, np.where(rows[..., 3:] < 0, np.nan, rows[..., :3]), first)
 
 
-def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) -> JointMotion:
-    points = np.asarray(contents["data"]["points"], np.float64)  # [4, N, T]
-    residual = np.asarray(contents["data"]["meta_points"]["residuals"], np.float64)[0]
-    frames = _frames(contents)
-    if not points.shape[1] or not frames:
-        raise damaged(path, "holds no points")
-    xyz = np.where(residual < 0, np.nan, points[:3]).transpose(2, 1, 0)
-    if frames > len(xyz):
-        xyz = np.concatenate([xyz, _beyond(path, contents, len(xyz), frames)])
-    labels = _labels(contents, xyz.shape[1])
-    unit = unit or metric_unit(_text(contents, "POINT", "UNITS") or "")
-    axes = axes or _SCREEN_UP.get(_text(contents, "POINT", "Y_SCREEN") or "", "z-up")
-    position = to_metres_z_up(path, xyz, unit, axes)
-    return JointMotion(_times(path, contents, frames), joint_names(labels), position[:, None])
+def _floats(content: Any, processor: int, order: str) -> Float:
+    """Convert bytes to numbers; DEC stores the half with the sign first, and four times the value."""
+    if processor == _DEC:
+        halves = np.frombuffer(content, "<u2").reshape(-1, 2)[:, ::-1]
+        return np.ascontiguousarray(halves).view("<f4").ravel().astype(np.float64) / 4
+    return np.frombuffer(content, f"{order}f4").astype(np.float64)
 
 
-def _frames(contents: Any) -> int:
-    read = int(np.shape(contents["data"]["points"])[2])
-    first, last = (_words(contents, f"ACTUAL_{end}_FIELD") for end in ("START", "END"))
-    return max(read, last - first + 1) if first is not None and last is not None else read
+def _parameters(section: bytes, processor: int, order: str) -> dict[tuple[str, str], Sequence[float | str]]:
+    """Parse the parameters; ValueError, IndexError or struct.error: they do not follow each other."""
+    at, groups = 4, dict[int, str]()
+    found: list[tuple[int, str, Sequence[float | str]]] = []
+    while at < len(section) and section[at]:
+        length, group = struct.unpack_from("2b", section, at)
+        step = at + 2 + abs(length)
+        name = section[at + 2 : step].decode("latin-1").upper()
+        (further,) = struct.unpack_from(f"{order}H", section, step)
+        if group < 0:
+            groups[-group] = name
+            end = step + 3 + section[step + 2]
+        else:
+            kind, dimensions = struct.unpack_from("bB", section, step + 2)
+            sides = list(section[step + 4 : step + 4 + dimensions])
+            begin = step + 4 + dimensions
+            end = begin + abs(kind) * math.prod(sides)
+            if kind not in {-1, 1, 2, 4} or dimensions > _MOST_DIMENSIONS or end >= len(section):
+                raise ValueError(f"{name} is of no kind")
+            found.append((group, name, _value(section[begin:end], kind, sides, processor, order)))
+            end += 1 + section[end]
+        if end > len(section) or (further and not end <= step + further <= len(section)):
+            raise ValueError(f"{name} leaves its section")
+        if not further:
+            break
+        at = step + further
+    if not {group for group, *_ in found} <= groups.keys():
+        raise ValueError("a parameter is of no group")
+    return {(groups[group], name): value for group, name, value in found}
 
 
-def _words(contents: Any, name: str) -> int | None:
-    values = _values(contents, "TRIAL", name)
-    if len(values) == 0:
+def _value(content: bytes, kind: int, sides: list[int], processor: int, order: str) -> Sequence[float | str]:
+    if kind == -1:
+        width = sides[0] if sides else 1
+        return [content[k : k + width].decode("utf-8", "replace") for k in range(0, len(content), width or 1)]
+    if kind == 4:
+        return list(_floats(content, processor, order).tolist())
+    return list(np.frombuffer(content, f"{order}i{kind}").tolist())
+
+
+def _number(
+    parameters: Mapping[tuple[str, str], Sequence[float | str]], group: str, name: str
+) -> float | None:
+    value = next(iter(parameters.get((group, name), ())), None)
+    return value if isinstance(value, int | float) and math.isfinite(value) else None
+
+
+def _words(values: Sequence[Any]) -> int | None:
+    if not values:
         return None
-    # Theia3D writes them as a table of 2 x 1.
-    low, high = (int(v) & 0xFFFF for v in [*np.ravel(values).tolist(), 0][:2])
+    low, high = (int(v) & 0xFFFF for v in [*values, 0][:2])
     return low | high << 16
 
 
-def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
-    """Read the frames [T, N, 3] that ezc3d leaves out because the header cannot count them."""
-    points = int(np.shape(contents["data"]["points"])[1])
-    first = _number(contents, "POINT", "DATA_START")
-    scale = _number(contents, "POINT", "SCALE") or 0.0
-    if np.size(contents["data"]["analogs"]) or scale >= 0 or first is None:
-        problem = f"holds {frames} frames beside analog channels or in integers"
-        raise DataError(path, problem, "export it in parts")
-    start = (int(first) - 1) * _BLOCK + read * points * 16
-    values = np.fromfile(path, "<f4", count=(frames - read) * points * 4, offset=start)
-    if len(values) < (frames - read) * points * 4:
-        raise damaged(path, f"breaks off before the last of its {frames} frames")
-    rows = values.reshape(frames - read, points, 4).astype(np.float64)
-    return np.where(rows[..., 3:] < 0, np.nan, rows[..., :3])
+def _motion(path: Path, contents: _Contents, *, unit: str | None, axes: str | None) -> JointMotion:
+    labels = _labels(contents, contents.points.shape[1])
+    unit = unit or metric_unit(contents.text("POINT", "UNITS") or "")
+    axes = axes or _SCREEN_UP.get(contents.text("POINT", "Y_SCREEN") or "", "z-up")
+    position = to_metres_z_up(path, contents.points, unit, axes)
+    return JointMotion(_times(path, contents, len(position)), joint_names(labels), position[:, None])
 
 
-def _labels(contents: Any, count: int) -> tuple[str, ...]:
+def _labels(contents: _Contents, count: int) -> tuple[str, ...]:
     """Return the points' names; for our own files the full ones, where labels were shortened."""
     labels = [*_texts(contents, "LABELS"), *(f"point{k + 1}" for k in range(count))][:count]
-    if _text(contents, "MOCAP", "FIRST_T_NS") is not None:
+    if contents.text("MOCAP", "FIRST_T_NS") is not None:
         labels = [
             full or label for full, label in zip(_texts(contents, "DESCRIPTIONS"), labels, strict=False)
         ]
     return tuple(_unique(labels))
 
 
-def _texts(contents: Any, name: str) -> list[str]:
+def _texts(contents: _Contents, name: str) -> list[str]:
     """Return a list of POINT, which continues in LABELS2, LABELS3 after 255 entries."""
     more = [f"{name}{k}" if k > 1 else name for k in range(1, 100)]
-    return [str(text) for part in more for text in _values(contents, "POINT", part)]
+    return [str(text).strip(" \0") for part in more for text in contents.values("POINT", part)]
 
 
-def _times(path: Path, contents: Any, frames: int) -> Int64:
-    first, last = (_text(contents, "MOCAP", f"{end}_T_NS") for end in ("FIRST", "LAST"))
-    rate = _number(contents, "POINT", "RATE")
+def _times(path: Path, contents: _Contents, frames: int) -> Int64:
+    first, last = (contents.text("MOCAP", f"{end}_T_NS") for end in ("FIRST", "LAST"))
+    rate = contents.number("POINT", "RATE")
     if first is not None and last is not None:
         try:
             start, span = int(first), int(last) - int(first)
@@ -231,27 +244,9 @@ def _times(path: Path, contents: Any, frames: int) -> Int64:
         return np.asarray(start + since, np.int64)
     if not rate or not 0 < rate < 1e6:
         raise damaged(path, f"states a rate of {rate} Hz")
-    number = contents["header"]["points"]["first_frame"]
-    start = number if 0 <= number < _MOST_FIRST_FRAME else 0
-    times: Int64 = np.rint((start + np.arange(frames)) * (1e9 / rate)).astype(np.int64)
+    number = max(contents.first_frame - 1, 0)
+    times: Int64 = np.rint((number + np.arange(frames)) * (1e9 / rate)).astype(np.int64)
     return times
-
-
-def _values(contents: Any, group: str, name: str) -> Sequence[Any]:
-    try:
-        return list(contents["parameters"][group][name]["value"])
-    except (KeyError, TypeError):
-        return []
-
-
-def _text(contents: Any, group: str, name: str) -> str | None:
-    values = _values(contents, group, name)
-    return str(values[0]).strip() if len(values) else None
-
-
-def _number(contents: Any, group: str, name: str) -> float | None:
-    values = _values(contents, group, name)
-    return float(values[0]) if len(values) else None
 
 
 class C3dExport:
