@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     type=click.Choice(["none", "small", "full"]),
     default="small",
     show_default=True,
-    help="Pictures of the videos beside the 3D view: none, at most 3 MB, or at most 15 MB.",
+    help="Pictures of the videos beside the 3D view: none, at most 3 MB, or at most 10 MB.",
 )
 @force_option
 @overwrite_option

@@ -44,24 +44,19 @@ def run_command(folder: Path, yes: bool, workers: int, shown: Shown) -> None:
         questions.confirm(manifest, remark)
     with watching(shown.level) as progress:
         result = run(manifest, workers=workers, progress=progress)
-    assumed = assumed or result.assumed
     verdict: dict[str, Any] = result.reconstructed.metrics["verdict"]
     if shown.as_json:
         print_json(
             {
                 "flight": str(manifest),
                 "session": str(result.session),
-                "assumed": assumed,
+                "assumed": result.assumed,
                 "verdict": verdict,
                 "page": str(result.page),
             }
         )
         return
     say_warnings(result.warnings, shown.quiet)
-    if assumed:
-        listed = "; ".join(map(one_line, assumed))
-        count = f"{len(assumed)} assumption{'' if len(assumed) == 1 else 's'}"
-        say(f"{count}, marked in {manifest}: {listed}", err=True)
     say(f"page: {result.page}")
     print_verdict(verdict, result.session, manifest)
 

@@ -179,8 +179,10 @@ def draft(
     search.left_out.pop(_absolute(target), None)
     if not found:
         path, reason = home, f"holds nothing that can be used ({len(search.left_out)} files)"
-        if len(search.left_out) == 1:
-            [(path, reason)] = search.left_out.items()
+        for file, why in search.left_out.items():
+            if len(search.left_out) == 1 or "; " in why:  # it can be mended
+                path, reason = file, why
+                break
         raise DataError(path, reason, "" if "; " in reason else EXPECTED, code="wrong-kind")
 
     candidates = [each for each in found if isinstance(each, Proposal)]

@@ -34,6 +34,7 @@ from pipelines.session.storage import (
     as_data_error,
     make_folder,
     read_json,
+    refuse_inside_session,
     remove_tree,
     sha256_of,
     sync,
@@ -100,6 +101,8 @@ def export(
     exports = [find_export(name) for name in dict.fromkeys(formats)]
     asked = {"unit": unit, "axes": axes, "time": time}
     chosen = {format_.name: _chosen(format_, asked) for format_ in exports}
+    if output is not None:
+        refuse_inside_session(output, "--output")
     recording = load_recording(folder, pictures_hz=pictures_hz)
     target = output or folder.resolve().with_name(f"{session_name(folder)}.export")
     is_new = not target.exists()

@@ -273,7 +273,7 @@ def reconstruct(
                 f" `trials` are those of {draws} (seed {disturbance.seed}), not the flight's"
             )
         _write_tables(run.folder, stored, gait, bodies)
-        metrics = write_figures(run.folder, jsonable(metrics), description.guessed_lenses)
+        metrics = write_figures(run.folder, jsonable(metrics), description)
         warnings += [*stored.warnings, *_unused_cameras(flight.cameras, stored.result)]
         record = run.publish(counts=_counts(metrics, stored, flight.swaps), warnings=warnings)
         for name, (before, now) in run.replaces.items():

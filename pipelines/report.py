@@ -318,9 +318,9 @@ def content_of(folder: Path) -> SessionContent:
     return _load(folder, read_description(folder), records)
 
 
-# A page is drawn from six thousand times of one person with 33 joints, or as much of others: more change no
+# A page is drawn from 4500 times of one person with 33 joints, or as much of others: more change no
 # figure, and take memory.
-MAX_ROWS = 200_000
+MAX_ROWS = 150_000
 
 
 class _Shown:

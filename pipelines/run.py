@@ -10,7 +10,6 @@ from pipelines.ingest import Ingested, ingest
 from pipelines.reconstruct import Reconstructed, reconstruct
 from pipelines.replan import replan
 from pipelines.report import report
-from pipelines.session.description import assumptions_as_warnings
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 
@@ -22,11 +21,11 @@ class Ran:
     """The results of all stages of a flight."""
 
     manifest: Path
-    assumed: list[str]  # what the manifest assumes; its keys alone if it was not drafted now
+    assumed: list[str]  # keys that the manifest assumes, as the report lists them
     session: Path
     reconstructed: Reconstructed
     page: Path
-    warnings: list[str]  # without a line for what is assumed
+    warnings: list[str]
 
 
 def run(
@@ -39,7 +38,7 @@ def run(
     holds no flight, something is missing that only the user knows, or a stage cannot do its work.
     """
     progress = progress or Silent()
-    manifest, assumed = drafted(folder, ask=ask, progress=progress)
+    manifest, _ = drafted(folder, ask=ask, progress=progress)
     ingested, left_out = _ingested(manifest, progress)
     session, description = ingested.folder, ingested.description
     reconstructed = reconstruct(session, workers=workers, progress=progress)
@@ -49,11 +48,8 @@ def run(
         except DataError as error:
             progress.note(f"planners were not compared: {error}")
     page = report(session).place
-    said = [*left_out, *description.warnings, *reconstructed.record.warnings]
-    warnings = [
-        each for each in dict.fromkeys(said) if each not in assumptions_as_warnings(description.assumptions)
-    ]
-    return Ran(manifest, assumed or description.assumptions, session, reconstructed, page, warnings)
+    warnings = dict.fromkeys([*left_out, *description.warnings, *reconstructed.record.warnings])
+    return Ran(manifest, description.assumptions, session, reconstructed, page, list(warnings))
 
 
 def _ingested(manifest: Path, progress: Progress) -> tuple[Ingested, list[str]]:

@@ -29,11 +29,14 @@ from pipelines.drafting.matching import CameraDraft, Chosen, FlightDraft, known_
 from pipelines.session.manifest import PICTURES, SCHEMA, CameraSources, Manifest
 from pipelines.session.yaml_models import YamlModel
 
-# Most cameras of drones film at 30 pictures a second unless asked otherwise.
-ASSUMED_FPS = 30
+# Pictures a second of usual cameras; most of those of drones film at the first unless asked otherwise.
+USUAL_FPS = (30, 25, 24, 50, 60)
 
 # Ingest bridges a gap of half a second between two poses unless asked otherwise.
 BRIDGED_NS = 500_000_000
+
+# Logs begin and end about a second around the film, or a tenth of a long flight.
+UNCOVERED_NS = 1_000_000_000
 
 # More alternatives make the manifest unreadable.
 MAX_LISTED = 8
@@ -215,7 +218,7 @@ class _ManifestWriter:
             return {}  # the log's own stamps
         if film and film.clock == "none":
             remark = self.miss(camera, "frame_times", "the times of its pictures, which EXIF does not have")
-            times = DraftedKey(None, [remark], example={"start": "SECONDS", "fps": ASSUMED_FPS})
+            times = DraftedKey(None, [remark], example={"start": "SECONDS", "fps": USUAL_FPS[0]})
             return {"frame_times": times, "clock": clock}
         if (known := known_start(camera)) is not None:
             settings: dict[str, object] = {"start": (Decimal(known.start_ns) / 10**9).normalize()}
@@ -230,8 +233,8 @@ class _ManifestWriter:
         if film and start is None:
             why = "when the first frame was taken, if not at 0"
             return {"frame_times": DraftedKey(None, [why], example={"start": "SECONDS"}), "clock": clock}
-        settings = ({} if start is None else {"start": start}) | ({} if film else {"fps": ASSUMED_FPS})
-        assumed = [] if film else [f"fps {ASSUMED_FPS}"]
+        settings = ({} if start is None else {"start": start}) | ({} if film else {"fps": _usual_fps(camera)})
+        assumed = [] if film else [f"fps {_usual_fps(camera)}"]
         assumed.append("the first frame at 0 s" if start is None else f"start, {reason}")
         remark = self.assume(camera, "frame_times", ", ".join(assumed))
         return {"frame_times": DraftedKey(self.guessed(settings), [remark]), "clock": clock}
@@ -244,8 +247,7 @@ class _ManifestWriter:
         spans = {what: span for what, span in (("its poses", poses), ("the truth", truth)) if span}
         if poses and truth and poses.overlap_ns(truth) < 0:
             spans = {"its poses": poses}  # the truth has another zero of time
-        listed = [c.frames for c in camera.pictures["keypoints"] if isinstance(c, FoundFrames)]
-        length_ns = camera.film.length_ns if camera.film else sum(listed[:1]) * 10**9 // ASSUMED_FPS
+        length_ns = camera.film.length_ns if camera.film else _frames(camera) * 10**9 // _usual_fps(camera)
         filmed = TimeSpan(0, length_ns)
         if all(filmed.overlap_ns(span) >= 0 for span in spans.values()):
             return None, ""
@@ -506,6 +508,21 @@ def _lens(camera: CameraDraft) -> dict[str, object] | None:
 def _settings(candidate: Proposal) -> dict[str, object]:
     logged = candidate.kind == "pose" and ("topic" in candidate.settings or "parent" in candidate.settings)
     return {**candidate.settings, **({"of": "body" if candidate.of_body else "camera"} if logged else {})}
+
+
+def _frames(camera: CameraDraft) -> int:
+    """Return the number of frames that a camera's keypoints list."""
+    return next((c.frames for c in camera.pictures["keypoints"] if isinstance(c, FoundFrames)), 0)
+
+
+def _usual_fps(camera: CameraDraft) -> int:
+    """Return the likeliest rate of keypoints: the first usual one at which they last as long as the poses."""
+    poses = camera.choices["pose"].taken.span if "pose" in camera.choices else None
+    for fps in USUAL_FPS:
+        longer_ns = poses.length_ns - _frames(camera) * 10**9 / fps if poses else 0
+        if poses and -UNCOVERED_NS <= longer_ns <= max(UNCOVERED_NS, poses.length_ns // 10):
+            return fps
+    return USUAL_FPS[0]
 
 
 def _first_frame(listed: FoundFrames, film: FoundFilm | None) -> int:

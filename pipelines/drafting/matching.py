@@ -41,7 +41,7 @@ from pipelines.drafting.found import (
     order,
     unique,
 )
-from pipelines.drafting.motion import explains_better
+from pipelines.drafting.motion import SIGNIFICANT_SIGMAS, explains_better, sigmas_above
 from pipelines.geometry.arrays import Float, RelativeTo
 
 # Two receivers on one drone state places that differ by less, m.
@@ -188,6 +188,7 @@ def match(
     of: dict[str, list[Proposal]] = {}
     for candidate in every:
         of.setdefault(candidate.kind, []).append(candidate)
+    of = {kind: _with_own_words(alike) for kind, alike in of.items()}
     poses = of.get("pose", [])
     true = [replace(c, is_true=True) for c in poses if _is_true(c)]
     actors = [c for c in poses if c.topic and is_called(c.topic, ACTOR)]
@@ -249,6 +250,17 @@ def match(
         free_intrinsics=[c for c in of.get("intrinsics", []) if c not in mentioned],
         unused=sorted(unused.values(), key=lambda each: each.place),
     )
+
+
+def _with_own_words(alike: Sequence[Proposal]) -> list[Proposal]:
+    """Add labels without words that all things of a kind share: vio_west, vio_east are west and east."""
+    labels = {candidate.labels[0] for candidate in alike}
+    names = [{word.key for word in label if word.number is None} for label in labels]
+    shared = set[object]().union(*names[:1]).intersection(*names)
+    own = {label: tuple(word for word in label if word.key not in shared) for label in labels}
+    if not shared or not all(own.values()):
+        return list(alike)
+    return [replace(candidate, labels=(*candidate.labels, own[candidate.labels[0]])) for candidate in alike]
 
 
 def _is_true(candidate: Proposal) -> bool:
@@ -330,7 +342,9 @@ def _home(cameras: list[CameraDraft], candidate: Proposal) -> CameraDraft:
         if _same(camera.label, candidate):
             return camera
     for least in (PART, NUMBER):
-        fits = [c for c in cameras if not c.pictures[candidate.kind] and affinity(c.label, label) >= least]
+        fits = [
+            c for c in cameras if not c.pictures[candidate.kind] and _likeness(candidate, c.label) >= least
+        ]
         if len(fits) == 1:
             fits[0].label = max(fits[0].label, label, key=len)
             return fits[0]
@@ -381,7 +395,7 @@ def _pair_by_content(
     filmed = [(c, film) for c in cameras if "pose" not in c.choices and (film := c.film) is not None]
     possible = {c.name: [log for log in likeliest.values() if _may_be_of(film, log)] for c, film in filmed}
     uses = Counter(id(log) for logs in possible.values() for log in logs)
-    found: dict[str, tuple[Proposal, MotionMatch]] = {}
+    found: dict[str, tuple[Proposal, MotionMatch, float]] = {}
     for camera, film in filmed:
         logs = possible[camera.name]
         if len(logs) == 1 and uses[id(logs[0])] == 1:
@@ -397,9 +411,10 @@ def _pair_by_content(
             found[camera.name] = own
     for camera, _ in filmed:
         motion = found.get(camera.name)
-        if motion is not None and sum(motion[0] is log for log, _ in found.values()) == 1:
-            log, alike = motion
-            camera.choices["pose"] = Chosen(log, named=False, why="by their motion", start_ns=alike.start_ns)
+        if motion is not None and sum(motion[0] is log for log, *_ in found.values()) == 1:
+            log, alike, sigmas = motion
+            why = f"by the motion in its pictures, {sigmas:.0f} sigma above all else"
+            camera.choices["pose"] = Chosen(log, named=False, why=why, start_ns=alike.start_ns)
             camera.motion = alike
             if alike.gimbal is not None:
                 camera.choices["gimbal"] = Chosen(alike.gimbal)
@@ -616,12 +631,15 @@ def _share_time(log: Proposal, other: Proposal) -> bool:
     return 2 * log.span.overlap_ns(other.span) >= other.span.length_ns
 
 
-def _own_by_motion(known: Sequence[tuple[Proposal, MotionMatch]]) -> tuple[Proposal, MotionMatch] | None:
-    """Return the log that explains a video's motion clearly, and clearly better than all others."""
+def _own_by_motion(
+    known: Sequence[tuple[Proposal, MotionMatch]],
+) -> tuple[Proposal, MotionMatch, float] | None:
+    """Return the log that explains a video's motion clearly better than all others, and how clearly."""
     for log, alike in known:
         others = [other.gain for each, other in known if each is not log]
-        if all(explains_better(alike.gain, other) for other in (np.zeros_like(alike.gain), *others)):
-            return log, alike
+        sigmas = min(sigmas_above(alike.gain, other) for other in (np.zeros_like(alike.gain), *others))
+        if sigmas > SIGNIFICANT_SIGMAS:
+            return log, alike, sigmas
     return None
 
 

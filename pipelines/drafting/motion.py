@@ -85,13 +85,18 @@ def explain_motion(
 
 
 def explains_better(gain: Float, other: Float) -> bool:
-    """Test if gains of `explain_motion` [S] are clearly above others of the same video, or above 0.
+    """Test if gains of `explain_motion` [S] are clearly above others of the same video, or above 0."""
+    return sigmas_above(gain, other) > SIGNIFICANT_SIGMAS
 
-    The sum of their differences is compared with its standard deviation (Vuong 1989, independent stretches).
+
+def sigmas_above(gain: Float, other: Float) -> float:
+    """Divide the sum of differences of gains by its standard deviation (Vuong 1989, independent stretches).
+
+    That is taken as two or more: small differences without any spread are not significant.
     """
     known = (gain - other)[np.isfinite(gain - other)]
     sigma = float(np.std(known, ddof=1)) * np.sqrt(len(known)) if len(known) > 1 else np.inf
-    return float(known.sum()) > max(SIGNIFICANT_SIGMAS * sigma, SIGNIFICANT_SIGMAS**2 / 2)
+    return float(known.sum()) / max(sigma, SIGNIFICANT_SIGMAS / 2)
 
 
 def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int) -> _Path:

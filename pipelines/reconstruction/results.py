@@ -39,7 +39,7 @@ from pipelines.geometry.rig import CENTRES
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.body_fit import BodyFit
 from pipelines.reconstruction.observations import Camera, Observations
-from pipelines.session.description import Interpolation
+from pipelines.session.description import Description, Interpolation
 from pipelines.session.people import bones_of
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.storage import write_json
@@ -434,7 +434,7 @@ def _figures_of_trial(metrics: Mapping[str, Any]) -> dict[str, float | None]:
 # --- tables --------------------------------------------------------------------------------------------
 
 
-def write_figures(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[str]) -> dict[str, Any]:
+def write_figures(folder: Path, figures: Mapping[str, Any], description: Description) -> dict[str, Any]:
     """Write metrics.json, which is returned, and what it says of each joint and bone as tables beside it."""
     shape, intervals_of = figures["shape"], figures["intervals"]
     write_table(
@@ -446,7 +446,7 @@ def write_figures(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequ
     stored = {name: value for name, value in figures.items() if name != "per_joint"}
     stored["intervals"] = {name: value for name, value in intervals_of.items() if name != "per_joint"}
     stored["shape"] = {name: value for name, value in shape.items() if name != "bones"}
-    stored["verdict"] = verdict(folder, stored, guessed_lenses)
+    stored["verdict"] = verdict(folder, stored, description.guessed_lenses, description.guessed_rates)
     write_json(folder / "metrics.json", stored)
     return stored
 
@@ -670,7 +670,12 @@ LEAST_SHARE = 0.5
 USUAL_SHARE = 0.9
 
 
-def verdict(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[str]) -> dict[str, Any]:
+def verdict(
+    folder: Path,
+    figures: Mapping[str, Any],
+    guessed_lenses: Sequence[str] = (),
+    guessed_rates: Sequence[str] = (),
+) -> dict[str, Any]:
     """Judge a reconstruction without truth.
 
     `grade`: `good`, `usable`, `poor`, or `wrong` where the flight is doubted; `expected_error_mm`: the 80 %
@@ -690,8 +695,11 @@ def verdict(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[s
     expected = [round(predicted_mm * factor, 1) for factor in factors] if np.isfinite(predicted_mm) else None
     doubts, share = figures.get("doubts") or [], figures["reconstructed_share"]
     why = [str(doubt["what"]) for doubt in doubts]
-    if guessed_lenses:
-        named = ", ".join(guessed_lenses)
+    if named := ", ".join(guessed_rates):
+        why.append(
+            f"the frame rate of {named} is a guess, and times are as wrong as it: write frame_times.fps"
+        )
+    if named := ", ".join(guessed_lenses):
         why.append(
             f"the focal length of {named} is a guess, and sizes are as wrong as it is: add a calibration"
         )
@@ -714,7 +722,7 @@ def verdict(folder: Path, figures: Mapping[str, Any], guessed_lenses: Sequence[s
     elif expected is None or share < LEAST_SHARE or expected[1] > USABLE_MM:
         grade = "poor"
     else:
-        grade = "good" if expected[1] <= GOOD_MM else "usable"
+        grade = "good" if expected[1] <= GOOD_MM and not guessed_rates else "usable"
     mends = bool(doubts) and bool(doubts[0]["remedy"])
     return {
         "grade": grade,

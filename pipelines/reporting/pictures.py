@@ -83,9 +83,9 @@ Label = tuple[int, str, str]
 """Person, joint (K of a view), and what is written beside it."""
 
 Video = Literal["none", "small", "full"]
-"""Choice of the pictures in the page: none, at most 3 MB, or at most 15 MB before base64."""
+"""Choice of the pictures in the page: none, at most 3 MB, or at most 10 MB before base64."""
 
-_BUDGET = {"small": (3_000_000, 320, 55), "full": (15_000_000, 640, 70)}  # bytes, px, quality of WebP
+_BUDGET = {"small": (3_000_000, 320, 55), "full": (10_000_000, 640, 70)}  # bytes, px, quality of WebP
 
 
 class Window(NamedTuple):

@@ -35,7 +35,7 @@ from pipelines.session.people import DERIVED, bones_of, side_of
 from pipelines.session.records import MovingBody, Trajectory, full_covariance
 from pipelines.session.tables import trajectory_from
 
-# Longer flights are thinned out, so that a page with 15 MB of pictures stays below 25 MB in base64.
+# Longer flights are thinned out, so that a page with 10 MB of pictures stays below 25 MB in base64.
 MAX_BYTES = 6_000_000
 # Cameras alone need no more times to move smoothly.
 MAX_TIMES_WITHOUT_SKELETON = 3000

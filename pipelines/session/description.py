@@ -360,6 +360,12 @@ class Description(Entry):
         return [name for name in guessed if (found := maps[name]) is None or found.focal_ratio == 1.0]
 
     @property
+    def guessed_rates(self) -> list[str]:
+        """The cameras without a film, which would state its rate, whose frame times are a guess."""
+        unfilmed = [name for name, entry in self.cameras.items() if entry.media is None]
+        return [name for name in unfilmed if f"cameras.{name}.frame_times" in self.assumptions]
+
+    @property
     def recorded(self) -> dict[str, str]:
         """The hashes of recordings, as inputs of stages; clocks and calibrations do not change them."""
         recorded = {
@@ -385,9 +391,10 @@ class Description(Entry):
 
 
 def assumptions_as_warnings(assumptions: Sequence[str]) -> list[str]:
-    """State what `mocap init` guessed and nobody has confirmed, as one warning if there is anything."""
-    remedy = "confirm it in flight.yaml and take `assumed: true` away"
-    return [f"assumed by `mocap init`: {', '.join(assumptions)}; {remedy}"] if assumptions else []
+    """Count and list what was guessed and nobody has confirmed, in one warning if there is anything."""
+    noun = "assumption" if len(assumptions) == 1 else "assumptions"
+    remedy = "confirm each in flight.yaml and take its `assumed: true` away"
+    return [f"{len(assumptions)} {noun}: {', '.join(assumptions)}; {remedy}"] if assumptions else []
 
 
 def read_description(session: Path) -> Description:

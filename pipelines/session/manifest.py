@@ -75,8 +75,8 @@ def _fps(value: object) -> Fraction:
         fps = Fraction(text)
     except (ValueError, ZeroDivisionError):
         raise ValueError("is no frame rate; write 30, 29.97 or 30000/1001") from None
-    if not Fraction(1, 1000) <= fps <= 100_000:
-        raise ValueError("is no frame rate; it must lie between 0.001 and 100000")
+    if not Fraction(1, 1000) <= fps <= 1000:  # rates above it were percentages or forgotten points
+        raise ValueError("is no frame rate of a film, 0.001 to 1000 a second; write 30 or 29.97")
     return fps
 
 

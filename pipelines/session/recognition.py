@@ -216,10 +216,14 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
         return None
     if not is_control:
         return Likeness("is text, but not UTF-8", "save it as UTF-8")
+    return _misnamed(path) or Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
+
+
+def _misnamed(path: Path) -> Likeness | None:
     kinds = [f.title for f in FORMATS.all() if path.suffix and path.suffix.lower() in f.suffixes]
-    if 0 < len(kinds) <= _MOST_KINDS:
-        return Likeness(f"is called {path.suffix} but is no {' or '.join(kinds)} that can be read", _COPY)
-    return Likeness(f"is binary data that begins with {_quoted(head[:8])}", "")
+    if not 0 < len(kinds) <= _MOST_KINDS:
+        return None
+    return Likeness(f"is called {path.suffix} but is no {' or '.join(kinds)} that can be read", _COPY)
 
 
 def _is_wide(low: bytes, high: bytes) -> bool:
@@ -255,7 +259,7 @@ def _of_text(path: Path, head: bytes, size: int) -> Likeness:
         cells = [cell.strip(' "#') for cell in lines[0].split(mark)]
         if len(cells) > 2 and len(lines) > 1 and lines[1].count(mark) > len(cells) // 2:
             return _of_table(cells)
-    return Likeness("is text of no known kind")  # what it says may be a secret
+    return _misnamed(path) or Likeness("is text of no known kind")  # what it says may be a secret
 
 
 def _of_table(cells: list[str]) -> Likeness:

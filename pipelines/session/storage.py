@@ -455,18 +455,22 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
 def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
     """Refuse, with a DataError, to replace a session, a folder that holds one, or a part of one."""
     target = target.absolute()
-    if not target.is_dir():
-        return
     for folder, _, files in os.walk(target):
         for name in filter(files.__contains__, _OF_SESSIONS):
             what, within = _OF_SESSIONS[name], Path(folder).relative_to(target).as_posix()
             problem = f"is {what}" if within == "." else f"holds {what} in {within}"
             raise DataError(target, problem, f"name another folder with {option}")
     if not (target / mark).is_file():
-        for parent in target.parents:
-            if (parent / "session.json").is_file():
-                problem = "is a part of a session"
-                raise DataError(target, problem, f"name another folder with {option}", code="not-a-session")
+        refuse_inside_session(target, option)
+
+
+def refuse_inside_session(target: Path, option: str) -> None:
+    """Refuse, with a DataError, to write into a session, where its own stages would lose or remove it."""
+    target = target.absolute()
+    for folder in (target, *target.parents):
+        if (folder / "session.json").is_file():
+            problem = "is a session" if folder == target else f"is a part of the session {folder.name}"
+            raise DataError(target, problem, f"name another folder with {option}", code="wrong-kind")
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:

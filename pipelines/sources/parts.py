@@ -176,7 +176,9 @@ def _poses_entry(
             )
         span, covered = int(np.ptp(trajectory.t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
         if covered < MIN_COVERED_SHARE * span and span - covered > MIN_UNCOVERED_S:
-            note(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
+            fps = camera.frame_times and camera.frame_times.fps
+            rate = f"; is cameras.{name}.frame_times.fps: {float(fps):g} right?" if fps else ""
+            note(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses{rate}")
     return PosesEntry(
         source=pose.file,
         static=static,

@@ -151,6 +151,7 @@ USUAL_MISTAKES: list[tuple[str, Any, str, list[str]]] = [
     ("drone1.keypoint", "drone1.json", "bad-value", ["'keypoints'"]),
     ("drone1.frame_times.start", 1_700_003_600, "no-overlap", ["cameras.drone1.frame_times.start: 16999"]),
     ("drone1.frame_times.fps", 0, "bad-value", ["cameras.drone1.frame_times.fps: "]),
+    ("drone1.frame_times.fps", 3000, "bad-value", ["cameras.drone1.frame_times.fps: ", "29.97"]),
     ("world.frame", "nedd", "bad-value", ["world.frame: ", "'ned'"]),
     ("cameras", {}, "bad-value", ["cameras: "]),
     ("map", "site.bt", "no-such-file", ["site.bt"]),
