@@ -60,7 +60,7 @@ from pipelines.reconstruction.background_kernels import (
 )
 from pipelines.reconstruction.background_tracks import Followed, rays_at_stamps
 from pipelines.reconstruction.doubts.turning import common_offset
-from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.observations import Camera, ErrorModes
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
 
@@ -116,6 +116,8 @@ _LEVEL_STEPS = 20
 _DRAWS = 32
 # Levels have settled after so many rounds.
 _LEVEL_ROUNDS = 6
+# Errors that grow and bend over a flight are told apart by so many polynomials of time.
+_POLYNOMIALS = 4
 # MacKay's rule leaps where pictures determine a smaller share of a level's errors.
 _LEAST_DETERMINED = 0.3
 _LEAST_WHITE, _LEAST_RATE = (1e-3, 1e-4), (1e-4, 1e-5)  # m, rad, and per sqrt(s)
@@ -229,6 +231,8 @@ class Adjusted:
     rotation: Float  # [T, 3, 3] world_from_camera
     covariance: Float  # [T, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2)
     left: PoseErrors | None  # errors that remain; None where refused
+    modes: Float  # [T, 6, R] of the errors that remain (`ErrorModes`), but for a constant shift
+    shift_m: float  # standard deviation of that shift
     prior: PosePrior  # with levels as estimated
     points: int  # that were used
     reprojection_px: float  # median; NaN where there is no solution
@@ -283,14 +287,20 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
 
     def refused(reason: str, reprojection_px: float = np.nan) -> Adjusted:
         stays = prior.covariance(len(position))
-        return Adjusted(position, rotation, stays, None, prior, 0, reprojection_px, reason)
+        none = np.empty((len(position), 6, 0))
+        return Adjusted(
+            position, rotation, stays, None, none, prior.constant[0], prior, 0, reprojection_px, reason
+        )
 
     if not len(posed):
         return refused("none of its pictures has a pose")
     errors, covariance = np.zeros((len(position), 6)), prior.covariance(len(position))
     covariance[posed] = 0.0
     unbound, points, results = 0, 0, []
-    for rows, weight in _overlapping(np.array_split(posed, -(-len(posed) // STRETCH))):
+    parts = np.array_split(posed, -(-len(posed) // STRETCH))
+    # What several stretches share of a flight is constant.
+    modes = np.zeros((len(position), 6, 6 * (_POLYNOMIALS if len(parts) == 1 else 1)))
+    for rows, weight in _overlapping(parts):
         stretch = _Stretch.of(seen, rows, position, rotation)
         unbound += stretch.unbound
         if len(posed) < 2 or unbound > _MOST_UNBOUND * (len(posed) - 1):
@@ -305,6 +315,7 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
         errors[rows] += weight[:, None] * found.errors
         # The covariance of a mean is at most the mean of covariances, whatever the correlation.
         covariance[rows] += weight[:, None, None] * found.covariance
+        modes[rows] += weight[:, None, None] * found.modes[..., : modes.shape[2]]
         results.append(found)
     covariance[posed[:, None], range(3), range(3)] += prior.constant[0] ** 2
     pixels = float(np.median(np.concatenate([found.missed for found in results])))
@@ -319,6 +330,8 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
         covariance,
         # Stretches are alike: the one in the middle speaks for all.
         replace(left[len(left) // 2], assumed=prior.assumed),
+        modes,
+        float(np.hypot(prior.constant[0], results[len(results) // 2].place_m)),
         results[len(results) // 2].prior,
         points,
         pixels,
@@ -436,11 +449,13 @@ class _SolvedStretch:
     errors: Float  # [T, 6] of the logged poses
     covariance: Float  # [T, 6, 6] of them
     draws: Float  # [M, T, 6] of what the errors may be more, from the posterior
+    modes: Float  # [T, 6, R] of the same
     missed: Float  # [K] residuals, px
     prior: PosePrior
     clock: tuple[float, float] | None  # its offset and standard deviation (s), if it was unknown
     loosened: Float  # [T, 2] m, rad
     stands: bool = False
+    place_m: float = 0.0  # standard deviation of the place of a camera that stands
 
     def surprise(self, level: Float) -> float:
         """Compute the largest rms error of the axes, in standard deviations of the log's [2]."""
@@ -564,7 +579,15 @@ class _Stretch:
         rng = np.random.default_rng(0)
         draws[..., :3] += np.sqrt(variance) * rng.standard_normal((len(draws), 1, 3))
         levels = _with_position_levels(found.prior, prior.white[0], prior.slow[0])
-        return replace(found, errors=errors, covariance=covariance, draws=draws, prior=levels, stands=True)
+        return replace(
+            found,
+            errors=errors,
+            covariance=covariance,
+            draws=draws,
+            prior=levels,
+            stands=True,
+            place_m=variance**0.5,
+        )
 
     def _times_s(self) -> Float:
         """Return the times of the pictures [T], from the knots about them."""
@@ -600,8 +623,8 @@ class _Stretch:
         late = float(state.constant[-1]), float(np.sqrt(factored.corner[-1, -1]))
         clock = late if prior.clock_s > 0 else None
         missed *= _PIXEL_SIGMA
-        covariance = self._covariance(factored)
-        return _SolvedStretch(state.errors, covariance, errors, missed, prior, clock, self.loosened)
+        covariance, modes = self._covariance(factored), self._modes(factored)
+        return _SolvedStretch(state.errors, covariance, errors, modes, missed, prior, clock, self.loosened)
 
     def _solve(
         self, state: _StretchState, prior: PosePrior, rounds: int, loss: float = _LOSS, settle: int = 0
@@ -719,6 +742,28 @@ class _Stretch:
         own[:, column, row] = own[:, row, column]
         border = factored.border[self.place[:, None] + np.arange(6)]
         return np.asarray(own + border @ factored.corner @ np.swapaxes(border, 1, 2))
+
+    def _modes(self, factored: _Factored) -> Float:
+        """Compute the response [T, 6, R] of each picture's error to what its polynomials of time may be.
+
+        The mean comes first. Sizes are those of independent standard normal numbers: the response is the
+        covariance with the polynomials times the root of the inverse of theirs.
+        """
+        from scipy.linalg.lapack import dpbtrs
+
+        count = min(_POLYNOMIALS, len(self.rows))
+        powers = np.vander(self._times_s() - self._times_s().mean(), count, increasing=True)
+        moments = np.zeros((factored.band.shape[1], count, 6))
+        polynomials = np.linalg.qr(powers)[0]
+        for k in range(6):
+            moments[self.place + k, :, k] = polynomials
+        moment = moments.reshape(len(moments), -1)
+        shared = dpbtrs(factored.band, moment, lower=1)[0]
+        shared += factored.border @ (factored.corner @ (factored.border.T @ moment))
+        root = np.linalg.cholesky(moment.T @ shared + EXACT**2 * np.eye(moment.shape[1]))
+        response = np.zeros((len(self.rows), 6, 6 * _POLYNOMIALS))
+        response[..., : root.shape[1]] = np.linalg.solve(root, shared.T).T[self.place[:, None] + np.arange(6)]
+        return response
 
     def _estimated(
         self, state: _StretchState, draws: tuple[Float, Float, Float], prior: PosePrior
@@ -1029,6 +1074,7 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:
         sigma=np.sqrt(variances.mean(axis=2)),
         covariance=covariance,
         errors=found.left,
+        modes=ErrorModes(t_ns[posed], found.modes[posed], found.shift_m),
         loosened=_loosened_still(camera.loosened_at(t_ns[posed]), variances.mean(axis=2)),
     )
 

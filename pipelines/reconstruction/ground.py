@@ -1,11 +1,11 @@
-"""Constant position errors between cameras, found in patches of ground that two of them see.
+"""Errors between cameras, found in patches of ground that two of them see.
 
-The background determines a moving camera's attitudes and leaves its whole path free to shift
-(`reconstruction.background`). Its followed points are a cloud that shifts with it. A patch of ground about
+The background binds a moving camera's path to its attitudes and leaves its whole path free to shift
+(`reconstruction.background`). Its followed points are a cloud that moves with it. A patch of ground about
 a point of one camera's cloud is cut out of both cameras' stills as an orthophoto, and the second one is
-searched for the first. The displacement across the second camera's ray is the difference of the two
-position errors. The ground does not move, so the two stills may be of different times: those are taken that
-see the patch from the most similar directions.
+searched for the first. The displacement across the second camera's ray is what both cameras' errors make
+there: their shifts, a turn, and the modes of what the background leaves. The ground does not move, so the
+two stills may be of different times: those are taken that see the patch from the most similar directions.
 
 Only differences are found. The mean error of all bound cameras keeps its prior; it moves cameras and people
 together and is given apart as a covariance that all joints share.
@@ -13,7 +13,7 @@ together and is given apart as a covariance that all joints share.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import pairwise, permutations
 from typing import Any
 
 import cv2
@@ -89,15 +89,15 @@ _MOST_SIGHTINGS = 500_000
 _MEDIAN_OF_TWO = 2 * np.log(2)
 # Of the chi-square distribution with two degrees of freedom, 99 % are below this.
 _AGREEING = 9.2
-# Clouds and paths are bent a little: all patches of a pair share an error of this size.
+# Clouds and paths are bent by more than their modes: all patches of a pair share an error of this size.
 _PAIR_SIGMA_M = 0.012
 
 # One comparison errs by one cell.
 _MATCH_SIGMA_M = 0.03
 # Attitudes from the background err by this much at least: followed points drift alike.
 _TURN_SIGMA = np.radians(0.1)
-# A slow error of an attitude moves a patch as if it were this far away.
-_USUAL_RANGE_M = 10.0
+# Unknowns of a camera: shift and turn of the whole path, then its modes.
+_SHIFT, _TURN, _MODES = slice(0, 3), slice(3, 6), 6
 # Comparisons of one patch have errors with this correlation.
 _REPEATED = 0.5
 # A patch that is this many standard deviations off counts half.
@@ -133,7 +133,7 @@ class _View:
     between: Interpolation
     points: Float  # [N, 3] in the world of the camera's own poses
     covariance: Float  # [N, 3, 3]
-    by_turn: Float  # [N, 3, 3] derivative of a point by a constant attitude error
+    by_error: Float  # [N, 3, U] derivative of a point by the camera's unknowns
     normal: Float  # [N, 3] of the ground about each point
     still_t_ns: Int64  # [S]
     stills: list[dict[int, Picture]]  # [S] pyramids
@@ -179,15 +179,15 @@ class _Matches:
     covariance: Float  # [P, 3, 3] of each patch's place
     across: Float  # [K, 2, 3] two directions across the second camera's ray
     shift: Float  # [K, 3] m, where the second camera sees the patch, against where it should be
-    design: Float  # [K, 3, 6 C] derivative of this shift by the errors of all cameras
+    design: Float  # [K, 3, C U] derivative of this shift by the unknowns of all cameras
 
 
 @dataclass(frozen=True)
 class _Solution:
-    """Constant errors of all cameras: 3 C positions, then 3 C attitudes."""
+    """Unknowns of all cameras, U of each."""
 
-    errors: Float  # [6 C]
-    covariance: Float  # [6 C, 6 C]
+    errors: Float  # [C U]
+    covariance: Float  # [C U, C U]
 
 
 def bind_positions(
@@ -204,7 +204,7 @@ def bind_positions(
     pictures of each camera that takes part.
     """
     views = [_view(camera, followed.get(camera.name), stills.get(camera.name), between) for camera in cameras]
-    prior, bent = _prior_sigma(cameras), np.array([_bent(camera) for camera in cameras])
+    prior = _prior_sigma(cameras)
     pairs = [
         (a, b)
         for a, b in permutations(range(len(cameras)), 2)
@@ -212,32 +212,31 @@ def bind_positions(
     ]
     counts, used = np.zeros((len(pairs), 2), dtype=np.int64), np.zeros(len(pairs), dtype=np.bool_)
     most = min(_MOST_OF_PAIR, _MOST_PATCHES // max(len(pairs), 1))
-    of_pair = np.array([np.sqrt(_PAIR_SIGMA_M**2 + bent[a] ** 2 + bent[b] ** 2) for a, b in pairs])
     assumed = _assumed(cameras)
     for wider in (1.0, _GPS_LIKE) if assumed.any() else (1.0,):
         prior = np.where(assumed, wider * prior, prior)
-        solution = _Solution(np.zeros(6 * len(cameras)), np.diag(prior**2))
+        solution = _Solution(np.zeros(len(prior)), np.diag(prior**2))
         for share in _PASSES if pairs else ():
             # Where nothing is known the search goes far, and few patches are found; they narrow the next one.
             matches = _compare(views, pairs, solution, most // share)
             if not len(matches.pair):
                 used = np.zeros_like(used)
                 break
-            _, agree = _solve(matches, prior, of_pair)
+            _, agree = _solve(matches, prior)
             both = (matches.pair, matches.pair[agree])
             counts = np.stack([np.bincount(pair, minlength=len(pairs)) for pair in both], axis=1)
             used = (counts[:, 1] >= _FEWEST_PATCHES / share) & (counts[:, 1] > _AGREE * counts[:, 0])
             if not used.any():
                 break
-            solution, _ = _solve(_of_pairs(matches, used), prior, of_pair)
+            solution, _ = _solve(_of_pairs(matches, used), prior)
         if used.any():
             break
     if used.any():
         found = _of_pairs(matches, used)
         for _ in range(_LEVEL_ROUNDS):
             prior = _with_position_level(cameras, prior, solution)
-            solution, _ = _solve(found, prior, of_pair)
-    return _bound(cameras, pairs, counts, used, prior, solution, np.minimum(prior, _prior_sigma(cameras)))
+            solution, _ = _solve(found, prior)
+    return _bound(cameras, pairs, counts, used, solution, np.minimum(prior, _prior_sigma(cameras)))
 
 
 # --- clouds ----------------------------------------------------------------------------------------------
@@ -253,16 +252,16 @@ def _view(
         )
         rows = stills.rows[used]
         pyramids = [_pyramid(stills.picture(k)) for k in used.tolist()]
-    points, covariance, by_turn = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
+    points, covariance, by_error = np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 0))
     if isinstance(followed, Followed) and len(rows):
-        points, covariance, by_turn = _cloud(camera, followed, rows, between)
+        points, covariance, by_error = _cloud(camera, followed, rows, between)
     chosen, normal = _ground(points, covariance)
     return _View(
         camera,
         between,
         points[chosen],
         covariance[chosen],
-        by_turn[chosen],
+        by_error[chosen],
         normal,
         camera.frame_t_ns[rows],
         pyramids,
@@ -285,7 +284,7 @@ def _readout(camera: Camera) -> tuple[float, float]:
 def _cloud(
     camera: Camera, followed: Followed, rows: Int64, between: Interpolation
 ) -> tuple[Float, Float, Float]:
-    """Triangulate the points that stills show: places, covariances, derivatives by a constant turn."""
+    """Triangulate the points that stills show: places, covariances, derivatives by the unknowns."""
     tracks = _shown(followed, np.clip(np.searchsorted(followed.rows, rows), 0, len(followed.rows) - 1))
     xy, t_ns = tracks.xy, camera.frame_t_ns[followed.rows[tracks.picture]]
     delay_s = np.clip(row_delay_s(xy[:, 1], camera.intrinsics), *_readout(camera))
@@ -294,10 +293,10 @@ def _cloud(
     ray = np.append(undistort(xy, camera.intrinsics), np.ones((len(xy), 1)), axis=1)
     ray = np.einsum("kij,kj->ki", rotation, ray / np.linalg.norm(ray, axis=1, keepdims=True))
     known = np.isfinite(ray).all(axis=1)
-    ray, position, rotation = ray[known], position[known], rotation[known]
+    ray, position, rotation, when = ray[known], position[known], rotation[known], when[place[known]]
     names, number = np.unique(tracks.point[known], return_inverse=True)
     if not len(names):
-        return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 3))
+        return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3, 0))
     points = len(names)
     count = np.bincount(number, minlength=points)
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
@@ -315,13 +314,23 @@ def _cloud(
     covariance = np.linalg.inv(
         _sums(across * weight[:, None, None], number, points) + _ANYWHERE_M**-2.0 * np.eye(3)
     )
-    turned = -cross_matrix(arm) @ rotation
-    by_turn = covariance @ _sums(across @ turned * weight[:, None, None], number, points)
+    moved = across @ _moved(camera, when, arm, rotation) * weight[:, None, None]
+    by_error = covariance @ _sums(moved, number, points)
     far, off = (np.bincount(number, each, points) / np.maximum(count, 1) for each in (distance, missed))
     kept = (count >= _FEWEST_SIGHTINGS) & (np.trace(covariance, axis1=1, axis2=2) < _POINT_SIGMA_M**2)
     kept &= (off < _WORST_PX) & (far > _NEAREST_M) & (far < _FARTHEST_M)
     kept &= np.bincount(number, (ray * arm).sum(axis=1) > 0, points) == count
-    return place3[kept], covariance[kept], by_turn[kept]
+    return place3[kept], covariance[kept], by_error[kept]
+
+
+def _moved(camera: Camera, t_ns: Int64, arm: Float, rotation: Float) -> Float:
+    """Compute how points at `arm` [K, 3] from a camera move with it, by its unknowns [K, 3, U]."""
+    turned = -cross_matrix(arm) @ rotation
+    moved = [np.broadcast_to(np.eye(3), turned.shape), turned]
+    if camera.modes is not None:
+        response = camera.modes.at(t_ns)
+        moved.append(response[:, :3] + turned @ response[:, 3:])
+    return np.concatenate(moved, axis=2)
 
 
 def _shown(followed: Followed, pictures: Int64) -> Tracks:
@@ -382,9 +391,9 @@ def _compare(
     views: Sequence[_View], pairs: Sequence[tuple[int, int]], known: _Solution, most: int
 ) -> _Matches:
     """Look for at most so many patches of the first camera of each pair in stills of the second."""
-    cameras, pair = len(views), np.empty(0, dtype=np.int64)
+    of_camera, pair = _unknowns([view.camera for view in views]), np.empty(0, dtype=np.int64)
     patch, covariance = [np.empty(0, dtype=np.int64)], [np.empty((0, 3, 3))]
-    across, shift, design = [np.empty((0, 2, 3))], [np.empty((0, 3))], [np.empty((0, 3, 6 * cameras))]
+    across, shift, design = [np.empty((0, 2, 3))], [np.empty((0, 3))], [np.empty((0, 3, len(known.errors)))]
     for number, (a, b) in enumerate(pairs):
         first, second = views[a], views[b]
         seen_a, position_a, rotation_a, ray_a = first.seen(first.points, first.normal)
@@ -400,11 +409,10 @@ def _compare(
             continue
         i, s, t = np.array(alike).T
         point, normal, ray = first.points[i], first.normal[i], ray_b[t, i]
-        row = np.zeros((len(i), 3, 6 * cameras))
-        row[:, :, 3 * b : 3 * b + 3], row[:, :, 3 * a : 3 * a + 3] = np.eye(3), -np.eye(3)
-        turn_a, turn_b = 3 * (cameras + a), 3 * (cameras + b)
-        row[:, :, turn_b : turn_b + 3] = -cross_matrix(point - position_b[t, i]) @ rotation_b[t, i]
-        row[:, :, turn_a : turn_a + 3] = -first.by_turn[i]
+        row = np.zeros((len(i), 3, len(known.errors)))
+        arm = point - position_b[t, i]
+        row[:, :, of_camera[b]] = _moved(second.camera, second.still_t_ns[t], arm, rotation_b[t, i])
+        row[:, :, of_camera[a]] = -first.by_error[i]
         spread = row @ known.covariance @ np.swapaxes(row, 1, 2) + first.covariance[i]
         along = ray - (ray * normal).sum(axis=1, keepdims=True) * normal
         along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -581,49 +589,55 @@ def _vertex(before: float, top: float, after: float) -> float:
 # --- the errors --------------------------------------------------------------------------------------------
 
 
+def _unknowns(cameras: Sequence[Camera]) -> list[slice]:
+    """List where the unknowns of each camera stand."""
+    ends = np.cumsum([_MODES + (0 if c.modes is None else c.modes.response.shape[2]) for c in cameras])
+    return [slice(begin, end) for begin, end in pairwise([0, *ends.tolist()])]
+
+
 def _prior_sigma(cameras: Sequence[Camera]) -> Float:
-    """Build the prior standard deviations [6 C] of constant errors: positions, then attitudes."""
-    sigma = np.zeros((2, len(cameras)))
-    for c, camera in enumerate(cameras):
-        if camera.errors is not None:
-            for kind, number in enumerate((SHIFT_IN_WORLD, ROTATION)):
-                mine = [p.sigma0 for p in camera.errors.processes if p.number == number and p.constant]
-                sigma[kind, c] = np.linalg.norm(mine)
+    """Build the prior standard deviations [C U] of all unknowns."""
+    unknowns = _unknowns(cameras)
+    sigma = np.ones(unknowns[-1].stop)
+    for camera, of in zip(cameras, unknowns, strict=True):
+        shift = turn = EXACT
+        if camera.modes is not None:
+            shift = camera.modes.shift_m
+        elif camera.errors is not None:
+            shift, turn = (
+                sum(p.sigma0**2 for p in camera.errors.processes if p.number == number and p.constant) ** 0.5
+                for number in (SHIFT_IN_WORLD, ROTATION)
+            )
         elif camera.sigma is not None:
-            sigma[:, c] = np.median(camera.sigma, axis=0)
-        if not camera.static:
-            sigma[1, c] = max(sigma[1, c], _TURN_SIGMA)
-    return np.maximum(np.repeat(sigma.ravel(), 3), EXACT)
+            shift, turn = np.median(camera.sigma, axis=0)
+        sigma[of][_SHIFT] = max(shift, EXACT)
+        sigma[of][_TURN] = max(turn, EXACT if camera.static else _TURN_SIGMA)
+    return sigma
+
+
+def _means(cameras: Sequence[Camera]) -> Float:
+    """Compute the mean errors of all cameras [6 C], position and rotation of each, by all unknowns."""
+    unknowns = _unknowns(cameras)
+    means = np.zeros((6 * len(cameras), unknowns[-1].stop))
+    for c, (camera, of) in enumerate(zip(cameras, unknowns, strict=True)):
+        own = means[6 * c : 6 * c + 6, of]
+        own[:, :_MODES] = np.eye(6)
+        if camera.modes is not None:
+            own[:, _MODES:] = camera.modes.response.mean(axis=0)
+    return means
 
 
 def _assumed(cameras: Sequence[Camera]) -> Bool:
-    """Mark the prior standard deviations [6 C] that nobody stated: those of constant position errors."""
-    assumed = np.repeat([c.errors is not None and c.errors.assumed for c in cameras], 3)
-    return np.append(assumed, np.zeros_like(assumed))
+    """Mark the unknowns [C U] whose level nobody stated: constant shifts."""
+    unknowns = _unknowns(cameras)
+    assumed = np.zeros(unknowns[-1].stop, dtype=np.bool_)
+    for camera, of in zip(cameras, unknowns, strict=True):
+        assumed[of][_SHIFT] = camera.errors is not None and camera.errors.assumed
+    return assumed
 
 
-def _bent(camera: Camera) -> float:
-    """Compute the standard deviation (m) of what slow errors leave in the places of a camera's points.
-
-    An error that grows evenly over the path stretches the cloud: by its size over the path's length, which is
-    sqrt(12) times its standard deviation. Over a flight that is longer than an error lasts, it averages out.
-    """
-    if camera.static or camera.errors is None:
-        return 0.0
-    span_s = float(camera.frame_t_ns[-1] - camera.frame_t_ns[0]) / 1e9
-    way_m = float(np.linalg.norm(np.ptp(camera.trajectory.position, axis=0)))
-    stretched = max(np.sqrt(12) * _USUAL_RANGE_M / max(way_m, EXACT), 1.0)
-    variance = 0.0
-    for process in camera.errors.processes:
-        if not process.constant:
-            arm_m = _USUAL_RANGE_M if process.number == ROTATION else 1.0
-            lasts = min(2 * process.correlation_s / max(span_s, EXACT), 1.0)
-            variance += lasts * (arm_m * process.sigma0) ** 2
-    return float(stretched * np.sqrt(variance))
-
-
-def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solution, Bool]:
-    """Solve for constant errors with a prior [6 C] and errors that pairs share; patches [P] that agree."""
+def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
+    """Solve for all unknowns with a prior [C U] and errors that pairs share; patches [P] that agree."""
     cut = matches.across
     spread = (
         cut @ (matches.covariance[matches.patch] + _MATCH_SIGMA_M**2 * np.eye(3)) @ np.swapaxes(cut, 1, 2)
@@ -634,7 +648,7 @@ def _solve(matches: _Matches, prior: Float, of_pairs_m: Float) -> tuple[_Solutio
     shared = pairs[matches.pair[matches.patch]]
     of_pair = (shared[:, None, :, None] * np.eye(3)[:, None]).reshape(len(cut), 3, -1)
     design = cut @ np.concatenate([matches.design, of_pair], axis=2)
-    every = np.concatenate([prior, np.repeat(of_pairs_m[: len(pairs)], 3)])
+    every = np.concatenate([prior, np.full(3 * len(pairs), _PAIR_SIGMA_M)])
     errors = np.zeros(len(every))
     seen, back_cut = np.einsum("kij,kj->ki", cut, matches.shift), np.swapaxes(cut, 1, 2)
     for k in range(_ROUNDS):
@@ -671,43 +685,46 @@ def _bound(
     pairs: Sequence[tuple[int, int]],
     counts: Int64,
     used: Bool,
-    prior: Float,
     solution: _Solution,
     stated: Float,
 ) -> GroundBinding:
     """Move the largest group of cameras that are bound to each other, and narrow their `stated` errors."""
-    total = len(cameras)
-    group = _largest_group(total, [pair for pair, use in zip(pairs, used, strict=True) if use])
-    position, turn = solution.errors[: 3 * total].reshape(-1, 3), solution.errors[3 * total :].reshape(-1, 3)
-    columns = np.array([3 * c + k for c in group for k in range(3)], dtype=np.int64)
-    joint = solution.covariance[np.ix_(columns, columns)]
+    group = _largest_group(len(cameras), [pair for pair, use in zip(pairs, used, strict=True) if use])
+    means, unknowns = _means(cameras), _unknowns(cameras)
+    before = means @ np.diag(stated**2) @ means.T
+    after = means @ solution.covariance @ means.T
+    columns = np.array([6 * c + k for c in group for k in range(3)], dtype=np.int64)
+    joint = after[np.ix_(columns, columns)]
     every = np.tile(np.eye(3), (len(group), 1))
     common = np.zeros((3, 3))
     if group:
         common = np.asarray(np.linalg.inv(every.T @ np.linalg.inv(joint) @ every), dtype=np.float64)
     moved, left_m, reasons = list(cameras), {}, {}
+    stated_m = [_rms_sigma(before[6 * c : 6 * c + 3, 6 * c : 6 * c + 3]) for c in range(len(cameras))]
     for c, camera in enumerate(cameras):
+        place, turned = slice(6 * c, 6 * c + 3), slice(6 * c + 3, 6 * c + 6)
         if c not in group:
             reasons[camera.name] = _reason(c, cameras, pairs, counts)
             # Against the group's common error it is as uncertain as both together.
             if group:
-                wider = float(np.sqrt(prior[3 * c] ** 2 + np.trace(common) / 3))
-                moved[c] = _narrowed(camera, wider, None, float(stated[3 * c]))
+                wider = float(np.hypot(_rms_sigma(after[place, place]), _rms_sigma(common)))
+                moved[c] = _narrowed(camera, wider, None, stated_m[c])
             continue
-        place = slice(3 * c, 3 * c + 3)
-        own = float(np.trace(solution.covariance[place, place] - common)) / 3
+        own = float(np.trace(after[place, place] - common)) / 3
         relative = own * len(group) / (len(group) - 1)
         sigma = float(np.sqrt(max(relative, 0.0) + EXACT**2))
         left_m[camera.name] = sigma
-        turned = slice(3 * (total + c), 3 * (total + c) + 3)
-        turn_sigma = float(np.sqrt(np.trace(solution.covariance[turned, turned]) / 3))
-        log = camera.trajectory
+        log, found = camera.trajectory, solution.errors[unknowns[c]]
+        error = np.tile(found[:_MODES], (len(log.t_ns), 1))
+        if camera.modes is not None:
+            error += camera.modes.at(log.t_ns) @ found[_MODES:]
         trajectory = replace(
             log,
-            position=log.position - position[c],
-            quaternion_xyzw=multiply(log.quaternion_xyzw, quaternion_from_rotation_vector(-turn[c][None])),
+            position=log.position - error[:, :3],
+            quaternion_xyzw=multiply(log.quaternion_xyzw, quaternion_from_rotation_vector(-error[:, 3:])),
         )
-        moved[c] = _narrowed(replace(camera, trajectory=trajectory), sigma, turn_sigma, float(stated[3 * c]))
+        turn_sigma = _rms_sigma(after[turned, turned])
+        moved[c] = _narrowed(replace(camera, trajectory=trajectory), sigma, turn_sigma, stated_m[c])
     entry = {
         "patches": [
             {
@@ -720,13 +737,18 @@ def _bound(
             for (a, b), (n, good), use in zip(pairs, counts, used, strict=True)
         ],
         "position_sigma_m": {
-            camera.name: {"before": float(stated[3 * c]), "against_the_others": left_m.get(camera.name)}
+            camera.name: {"before": stated_m[c], "against_the_others": left_m.get(camera.name)}
             for c, camera in enumerate(cameras)
         },
-        "moved_m": {cameras[c].name: (-position[c]).tolist() for c in group},
+        "moved_m": {cameras[c].name: (-means[6 * c : 6 * c + 3] @ solution.errors).tolist() for c in group},
         "reasons": reasons,
     }
     return GroundBinding(moved, tuple(cameras[c].name for c in group), reasons, common, entry)
+
+
+def _rms_sigma(covariance: Float) -> float:
+    """Compute the standard deviation of a mean axis."""
+    return float(np.sqrt(np.trace(covariance) / 3))
 
 
 def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Solution) -> Float:
@@ -734,7 +756,7 @@ def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Sol
 
     A wide level would let the ground turn all cameras together: it binds their attitudes to each other better
     than to the world, and their places follow. A usual level counts as `USUAL_COUNT` more numbers. The
-    standard deviations [6 C] are no larger than before.
+    standard deviations [C U] are no larger than before.
     """
     assumed = _assumed(cameras)
     if not assumed.any():

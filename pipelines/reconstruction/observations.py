@@ -30,6 +30,27 @@ _USUAL = 1.5
 
 
 @dataclass(frozen=True)
+class ErrorModes:
+    """What is not known of a path after all: its error is a sum of modes with independent sizes.
+
+    The sizes have a standard deviation of 1. The whole path may have a constant shift besides.
+    """
+
+    t_ns: Int64  # [S]
+    response: Float  # [S, 6, R] of position in the world (m) and rotation vector in the camera (rad)
+    shift_m: float  # standard deviation of the constant shift
+
+    def at(self, t_ns: Int64) -> Float:
+        """Interpolate the response [..., 6, R]."""
+        after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, max(len(self.t_ns) - 1, 1))
+        before = self.t_ns[after - 1]
+        if len(self.t_ns) == 1:
+            return np.broadcast_to(self.response[0], (*t_ns.shape, *self.response.shape[1:]))
+        share = np.clip((t_ns - before) / (self.t_ns[after] - before), 0.0, 1.0)[..., None, None]
+        return np.asarray((1 - share) * self.response[after - 1] + share * self.response[after])
+
+
+@dataclass(frozen=True)
 class Camera:
     """Camera of a session.
 
@@ -51,6 +72,7 @@ class Camera:
     covariance: Float | None = None  # [N, 6, 6]
     errors: PoseErrors | None = None  # remaining errors of its poses, if they were refined beforehand
     loosened: Float | None = None  # [N, 2] m, rad: what poses in bad stretches of the log err by besides
+    modes: ErrorModes | None = None  # of what its background leaves open, if its poses were refined by it
 
     @cached_property
     def focal_px(self) -> float:

@@ -359,6 +359,10 @@ def test_attitudes_come_out_of_the_background(lost: float) -> None:
     # Paths are not moved: the constant part of the positions' errors stays.
     np.testing.assert_allclose((found.position - at).mean(axis=0), 0, atol=0.02)
     assert (found.covariance[:, range(3), range(3)] >= PRIOR.constant[0] ** 2).all()
+    # What modes say is part of the covariance, and for attitudes, which change slowly, most of it.
+    own, within = found.covariance[:, 3:, 3:], found.modes[:, 3:] @ found.modes[:, 3:].swapaxes(1, 2)
+    assert (np.linalg.eigvalsh(own - within) > -1e-9 * np.trace(own, axis1=1, axis2=2)[:, None]).all()
+    assert np.trace(within, axis1=1, axis2=2).mean() > 0.5 * np.trace(own, axis1=1, axis2=2).mean()
 
 
 def test_a_straight_way_tells_nothing_of_a_turn_about_itself() -> None:

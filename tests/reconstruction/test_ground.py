@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Intrinsics
 from pipelines.geometry.cameras import camera_matrix
 from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, UNKNOWN_SIGMA, PoseErrors, Process
-from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.geometry.poses import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+)
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks
 from pipelines.reconstruction.ground import bind_positions
 from pipelines.reconstruction.loading import load_pose_errors
-from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.observations import Camera, ErrorModes
 from pipelines.session.description import Description, Interpolation
 from pipelines.session.records import Detections, Trajectory
 
@@ -167,17 +172,27 @@ def test_offsets_are_found_where_nobody_stated_the_noise() -> None:
     assert np.linalg.norm(left[0] - left[1]) < 4 * np.linalg.norm(sigma)
 
 
-def test_slow_errors_widen_what_is_left_of_an_offset() -> None:
+def test_path_that_is_turned_as_a_whole_is_turned_back() -> None:
+    """A background keeps a path and its attitudes together, and may leave both turned about the vertical."""
     cameras, followed, stills = scene()
-    slow = Process(SHIFT_IN_WORLD, 0.04, correlation_s=100.0)  # all but constant over the flight
-    assert cameras[0].errors is not None
-    bent = replace(
-        cameras[0], errors=replace(cameras[0].errors, processes=(*cameras[0].errors.processes, slow))
+    turn, up = np.radians(1.0), np.array([0.0, 0.0, 1.0])
+    position, rotation = flown(90, 4.0)
+    away = position - position.mean(axis=0)
+    turned = matrix_from_quaternion(quaternion_from_rotation_vector(turn * up))
+    log = Trajectory(
+        cameras[0].trajectory.t_ns,
+        position.mean(axis=0) + away @ turned.T + ERRORS_M["north"],
+        quaternion_from_matrix(turned @ rotation),
     )
-    steady, with_slow = (
-        bind_positions([first, cameras[1]], followed, stills, between=BETWEEN) for first in (cameras[0], bent)
-    )
-    assert shift_sigma(steady.cameras[0]) < slow.sigma0 < shift_sigma(with_slow.cameras[0])
+    response = np.concatenate([np.cross(turn * up, away), turn * rotation[:, 2]], axis=1)[..., None]
+    modes = ErrorModes(log.t_ns, response, CONSTANT_M)
+    first = replace(cameras[0], trajectory=log, modes=modes)
+    binding = bind_positions([first, cameras[1]], followed, stills, between=BETWEEN)
+    assert binding.bound == ("north", "east")
+    found = matrix_from_quaternion(binding.cameras[0].trajectory.quaternion_xyzw)
+    left = rotation_vector_from_quaternion(quaternion_from_matrix(found @ np.swapaxes(rotation, 1, 2)))
+    # Patches of 1 cm on ground 16 m wide show a turn to some hundredths of a degree.
+    assert np.abs(left).max() < turn / 4
 
 
 def test_exact_camera_leaves_no_common_offset() -> None:
