@@ -76,8 +76,9 @@ _LOSS = 1.0
 # Losses that come before it: where logged poses are many pixels off, a narrow one rejects all sightings
 # (graduated non-convexity: Blake and Zisserman 1987; Yang et al. 2020).
 _WIDE = (30.0, 5.0)
-# Two steps with a wide loss are too few for attitudes that are further off.
-_FAR_RAD = 0.1
+# Two steps with a wide loss are too few for attitudes that are further off: 67 deg and a drifting path took
+# more than eight.
+_FAR_RAD, _FAR_ROUNDS = 0.1, 24
 # Two sightings of a point determine its direction and depth and test nothing.
 _FEWEST_SIGHTINGS = 3
 _LONGEST_S, _LONGEST = 1.0, (12, 30)  # sightings of a point: time, and at least and at most these pictures
@@ -165,6 +166,7 @@ class PosePrior:
     constant: tuple[float, float, float]  # m in the world, rad, m in the camera
     slow: tuple[Process, Process]  # shift in the world and rotation
     estimated: bool = False  # the levels of white and slow errors are only the start of an estimate
+    held: tuple[bool, bool] = (False, False)  # but those of slow positions, rotations were stated
     clock_s: float = 0.0  # of the offset of the pictures' clock, 0 for a known one
     assumed: bool = False  # nobody stated the constant errors either
 
@@ -172,7 +174,7 @@ class PosePrior:
     def of(cls, errors: PoseErrors | None) -> PosePrior:
         """Build the prior from stated pose errors; None for unknown ones.
 
-        Where only a large constant rotation is stated, the others are estimated: no log is exact in itself.
+        Beside a large constant rotation, what nobody stated is estimated: no log is exact in itself.
         """
         unknown = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]), _unknown(ROTATION, _UNKNOWN_RATE[1])
         if errors is None:
@@ -189,7 +191,9 @@ class PosePrior:
         whole = (constant[SHIFT_IN_WORLD], constant[ROTATION], constant[SHIFT_IN_CAMERA])
         slow = (_sum(SHIFT_IN_WORLD, changing[SHIFT_IN_WORLD]), _sum(ROTATION, changing[ROTATION]))
         if not any(errors.white) and whole[1] > _FAR_RAD:
-            return cls(_UNKNOWN_WHITE, whole, unknown, estimated=True)
+            held = bool(changing[SHIFT_IN_WORLD]), bool(changing[ROTATION])
+            either = (slow[0] if held[0] else unknown[0], slow[1] if held[1] else unknown[1])
+            return cls(_UNKNOWN_WHITE, whole, either, estimated=True, held=held)
         return cls(errors.white, whole, slow)
 
     @property
@@ -601,7 +605,7 @@ class _Stretch:
         state = _StretchState(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
         for loss in _WIDE:
             settle = _SETTLE_ROUNDS if loss == _WIDE[0] else 0
-            rounds = _ROUNDS if prior.constant[1] > _FAR_RAD else 2
+            rounds = _FAR_ROUNDS if prior.constant[1] > _FAR_RAD else 2
             found = self._solve(state, prior, rounds=rounds, loss=loss, settle=settle)
             if found is None:
                 return None
@@ -785,7 +789,8 @@ class _Stretch:
             _level(steps[:, of], spread[..., of], _rate(process), least)
             for of, process, least in zip(_KINDS, prior.slow, _LEAST_RATE, strict=True)
         ]
-        slow = _unknown(SHIFT_IN_WORLD, rate[0]), _unknown(ROTATION, rate[1])
+        found = _unknown(SHIFT_IN_WORLD, rate[0]), _unknown(ROTATION, rate[1])
+        slow = (prior.slow[0] if prior.held[0] else found[0], prior.slow[1] if prior.held[1] else found[1])
         return replace(prior, white=(white[0], white[1]), slow=slow)
 
     def _fresh(self, state: _StretchState, design: Float) -> Float:

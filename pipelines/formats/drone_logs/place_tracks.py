@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import Heading, describe_times, find_heading, parse_stamps, rows_below
@@ -76,20 +77,15 @@ def _read_gpx(path: Path) -> tuple[Int64, Bool, Float, bool]:
         match = re.search(pattern, text)
         return match[1].strip() if match else ""
 
-    stamps, rows = [], []
+    stamps: list[str] = []
+    rows: list[str] = []
     for point in _POINT.finditer(read_text(path)):
         stamps.append(of(_ELEMENT.format("time"), point[2]))
         texts = [of(_ATTRIBUTE.format(name), point[1]) for name in ("lat", "lon")]
-        rows.append([_number(text) for text in (*texts, of(_ELEMENT.format("ele"), point[2]))])
+        rows += [*texts, of(_ELEMENT.format("ele"), point[2])]
     t_ns, timed = parse_stamps(path, stamps)
-    return t_ns, timed, np.array(rows, np.float64).reshape(-1, 3), True
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        return float("nan")
+    values = pd.to_numeric(pd.Series(rows, dtype=object), errors="coerce").to_numpy(np.float64)
+    return t_ns, timed, values.reshape(-1, 3), True
 
 
 def _columns(text: str) -> tuple[Heading, dict[str, int], bool] | None:
