@@ -48,6 +48,9 @@ class Association:
     """Assignment of detections to people. T times, C cameras, P people; those who were logged come first."""
 
     choice: Int64  # [T, C, P] index into the detections of the camera at that time, -1 none
+    views: Int64  # [P] camera-frames chosen
+    refused: Int64  # [P] camera-frames with detections, none of them the person that other cameras see
+    resumed: Int64  # [P] times the person was lost by all and taken up again
     people: Int64  # [T] people whom at least two cameras see
     unused: Int64  # [C] usable detections, over all times, that belong to none of the chosen people
     phantoms: dict[str, int]  # bodies that two cameras see and that are left out, by `why_no_person`
@@ -128,9 +131,10 @@ def associate(
     bodies = [chain.body(seen.track) for chain in chains]
     doubts = tuple(why_no_body(body, views, scene) for body in bodies)
     chosen = np.stack([body.choice for body in bodies], axis=-1)
+    resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
         reasons.append("no two cameras agree on anybody: check poses, clocks and the stated noise")
-    return _counted(chosen, seen, refused, doubts, unseen, tuple(reasons))
+    return _counted(chosen, seen, resumed, refused, doubts, unseen, tuple(reasons))
 
 
 def associate_one_camera(
@@ -168,12 +172,13 @@ def associate_one_camera(
         actors = None
     chosen, total = np.full((len(time_s), 1, 0), -1, np.int64), 0.0
     wanted = (0 if actors is None else actors.shape[1]) if people is None else people
+    resumed: list[int] = []
     unseen: list[int] = []
     while bodies and (chosen.shape[2] < max(wanted, 1) or people is None):
         person = chosen.shape[2]
         logged = actors is not None and person < actors.shape[1]
         if logged and not any(body[2][person] > 0 for body in bodies):
-            chosen = np.append(chosen, np.full((len(time_s), 1, 1), -1), axis=2)
+            chosen, resumed = np.append(chosen, np.full((len(time_s), 1, 1), -1), axis=2), [*resumed, 0]
             unseen.append(person)
             continue
         rank = [(body[2][person] if logged else 0.0, body[3]) for body in bodies]
@@ -191,10 +196,11 @@ def associate_one_camera(
         mine = (track == owner[:, None]) & (track >= 0)
         choice = np.where(mine.any(axis=1), mine.argmax(axis=1), -1)[:, None, None]
         chosen = np.concatenate([chosen, choice], axis=2)
+        resumed.append(len(np.unique(owner[owner >= 0])) - 1)
     while chosen.shape[2] < max(wanted, 1):
-        chosen = np.append(chosen, np.full((len(time_s), 1, 1), -1), axis=2)
+        chosen, resumed = np.append(chosen, np.full((len(time_s), 1, 1), -1), axis=2), [*resumed, 0]
     doubts = ("",) * chosen.shape[2]
-    return _counted(chosen, seen, {}, doubts, tuple(unseen), tuple(reasons))
+    return _counted(chosen, seen, np.array(resumed, np.int64), {}, doubts, tuple(unseen), tuple(reasons))
 
 
 def _noise_of_logs_m(seen: Bodies, logs: Float, most_m: float) -> float:
@@ -404,17 +410,23 @@ def _far_from_log(tracks: list[_BodyTrack], log: Float) -> str:
 def _counted(
     chosen: Int64,
     seen: Bodies,
+    resumed: Int64,
     phantoms: Mapping[str, int],
     doubts: tuple[str, ...],
     unseen: tuple[int, ...],
     reasons: tuple[str, ...],
 ) -> Association:
     present = (chosen >= 0).transpose(2, 0, 1)
+    others_see = present.sum(-1, keepdims=True) > 1
+    refused = ~present & others_see & (seen.track >= 0).any(-1)
     standing = np.where(
         seen.views > 1, 1.0 / np.maximum(seen.views, 1), 0.0
     )  # a body of n views counts n times 1/n
     return Association(
         choice=chosen,
+        views=present.sum((1, 2)),
+        refused=refused.sum((1, 2)),
+        resumed=resumed,
         people=np.rint(standing.sum((1, 2))).astype(np.int64),
         unused=(seen.track >= 0).sum((0, 2)) - present.sum((0, 1)),
         phantoms=dict(sorted(phantoms.items())),

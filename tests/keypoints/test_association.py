@@ -207,6 +207,7 @@ def test_three_people_who_cross_keep_their_identities() -> None:
     alone = scene.associate(people=1)
     others = (scene.who >= 0).sum((0, 2)) - (alone.choice[..., 0] >= 0).sum(0)
     assert alone.unused.tolist() == others.tolist()
+    assert not result.resumed.any()
     assert result.reasons == ()
 
 
@@ -218,7 +219,8 @@ def test_a_lone_actor_never_loses_a_view_to_outliers_and_pose_noise(cameras: int
         white, bias = (MEDIUM, NONE) if noise == "white" else (NONE, MEDIUM)
         scene = film([ACTOR], cameras=cameras, outliers=0.05, white=white, bias=bias, seed=seed)
         result = scene.associate()
-        assert (result.choice >= 0).sum() == scene.who.size
+        assert result.views[0] == scene.who.size
+        assert result.refused[0] == 0
 
 
 @pytest.mark.parametrize("cameras", [2, 3, 5])
@@ -237,7 +239,7 @@ def test_the_logged_actor_is_found_among_people_under_pose_noise(cameras: int) -
 def test_a_log_that_is_near_nobody_is_reported() -> None:
     scene = film([ACTOR])
     result = scene.associate(1, straight((80.0, 0.0), (0.0, 0.0)))
-    assert (result.choice >= 0).sum() == scene.who.size
+    assert result.views[0] == scene.who.size
     assert "nobody is near the logged actor (nearest 77.0 m, median 80.0 m)" in result.reasons[0]
 
 
@@ -338,7 +340,7 @@ def test_a_bystander_stands_beyond_the_cameras_and_is_never_in_all_pictures(away
 
 
 def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> None:
-    """Hide the actor in one camera throughout: the bystander there is refused."""
+    """Hide the actor in one camera for good: the bystander there is refused and counted."""
     bystander = straight((1.0, 2.0), (0.0, 0.0))
     scene = film([ACTOR, bystander]).hide(0, camera=2)
     for camera in (0, 1, 3, 4):
@@ -347,6 +349,7 @@ def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> N
     chosen = scene.chosen(result)
     assert np.all(chosen[:, 2] == -1)
     assert np.all(chosen[:, [0, 1, 3, 4]] == 0)
+    assert result.refused[0] == len(scene.time_s)
     assert np.all(result.people == 1)
 
 
