@@ -312,7 +312,6 @@ def test_keypoints_in_any_order_are_worth_the_same(detector: str) -> None:
     assert path is not None
     assert measured_for("onnx:somebody's") is None
     calibration = read_calibration(path)
-    assert "tools/detector_errors.py" in calibration.origin
     joints = ("left_wrist", "nose", "right_hip")
     confidence = np.random.default_rng(4).uniform(0.0, 1.0, (50, 3))
     expected = calibration.probability(confidence, joints)
