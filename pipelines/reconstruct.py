@@ -397,9 +397,11 @@ def _write_tables(
 
 
 def _counts(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, object]) -> dict[str, object]:
-    """Count joints by status, undone swaps, filled and smoothed joints."""
+    """Count joints by status, undone swaps, filled and smoothed joints, and events of the association."""
+    events = ("views", "refused", "resumed")
     return {
         **metrics["status_counts"],
+        "association": {name: getattr(attempt.association, name).tolist() for name in events},
         "left_right_swaps": {"undone_over_time": swaps, "between_views": attempt.between_views},
         "filled": metrics["filled"],
         "smoothing": metrics["smoothing"],
