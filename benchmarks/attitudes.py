@@ -1,4 +1,4 @@
-"""Attitudes from pictures on rendered flights: `python -m benchmarks.accuracy attitudes`.
+"""Attitudes from pictures on rendered flights: `python -m benchmarks.attitudes`.
 
 The points that were followed through the films of the corpus are mapped once for each moving camera, by the
 same calls as `mocap ingest` with `pose.attitude: pictures`. The camera's true places are then disturbed many
@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.corpus.drawn import DrawnFlight
 from benchmarks.corpus.stored import flights, read_backgrounds
-from benchmarks.results import markdown_table
+from benchmarks.results import markdown_table, parser_of, show
 from pipelines.geometry.arrays import Int64, Intrinsics
 from pipelines.geometry.noise import Bias, GaussMarkov, NoiseModel, White, disturb, pose_errors
 from pipelines.geometry.poses import (
@@ -121,3 +121,11 @@ def _figures(
         nees.append(np.square(apart.mean(axis=0)).sum() / (3 * laid.common_sigma_rad**2))
     shown = [f"{np.median(off):.2f}", f"{np.mean(nees):.1f}"] if off else ["-", "-"]
     return [f"{refused} of {draws}", *shown]
+
+
+if __name__ == "__main__":
+    parser = parser_of(__doc__)
+    add_arguments(parser)
+    asked = parser.parse_args()
+    for key, lines in run(asked):
+        show(key, lines, write=asked.write)

@@ -375,7 +375,9 @@ class _ManifestWriter:
     def world(self) -> DraftedKey:
         """Return the axes of the world, which trajectories and logs do not state."""
         taken = [c.choices["pose"].taken for c in self.draft.cameras if "pose" in c.choices]
-        guessed = any(c.kind == "pose" and not isinstance(c, FlownPoses) for c in taken)
+        # Latitude and longitude leave no axes open; attitudes beside them do.
+        open_axes = [c for c in taken if c.kind == "pose" and not (c.by_gps and c.unturned)]
+        guessed = any(not isinstance(c, FlownPoses) for c in open_axes)
         origin = "#   origin: {latitude_deg: 0, longitude_deg: 0, altitude_m: 0}  # else the first position's"
         return DraftedKey(
             {"frame": "enu"} | ({"assumed": True} if guessed else {}),
