@@ -1,7 +1,6 @@
 """Storage: reproducible JSON, hashes, codes of errors, arrays that wait in files, tables read in parts."""
 
 import math
-import pickle
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +20,10 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import (
     SKELETON,
-    TRUTH,
     join_tables,
     motion_from,
     read_motion,
     read_table,
-    write_table,
 )
 
 NUMBERS = st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False)
@@ -104,21 +101,11 @@ def test_hash_of_a_folder_sees_names_contents_and_nothing_else(tmp_path: Path) -
     assert len({reference, *hashes}) == 1 + len(changed)
 
 
-def test_a_pickled_error_keeps_its_code() -> None:
-    error = pickle.loads(pickle.dumps(DataError("a.bag", "is empty", code="empty")))  # noqa: S301
-    assert (error.code, str(error)) == ("empty", "a.bag: is empty")
-
-
 @dataclass(frozen=True)
 class Held:
     name: str
     values: dict[str, Float]
     nothing: None = None
-
-
-def resident_bytes() -> int:
-    """Return the memory that the process has, pages of files included."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 def test_waiting_arrays_keep_their_values_and_changes(tmp_path: Path) -> None:
@@ -136,18 +123,6 @@ def test_waiting_arrays_keep_their_values_and_changes(tmp_path: Path) -> None:
     assert values["a"][1, 2] == 6.0  # a copy
     assert all(array.ctypes.data % 64 == 0 and array.flags.writeable for array in held.values.values())
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say it there")
-def test_waiting_arrays_take_no_memory_until_they_are_used(tmp_path: Path) -> None:
-    """Compare 64 MB in use and waiting; a quarter of that is left for everything else."""
-    waiting = Waiting(tmp_path)
-    held = waiting.put(np.ones(8 << 20))
-    assert float(held.sum()) == 8 << 20
-    used = resident_bytes()
-    waiting.release()
-    assert used - resident_bytes() > 48e6
-    assert float(held.sum()) == 8 << 20
 
 
 JOINTS = ("nose", "left_hip", "right_hip")
@@ -194,11 +169,3 @@ def test_a_motion_read_in_parts_is_that_of_the_whole_table(
     assert found.joints == expected.joints
     for name in ("t_ns", "position", "status", "views", "reprojection_px", "covariance"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-
-
-def test_a_table_without_a_column_of_the_motion_is_refused(tmp_path: Path) -> None:
-    write_table(tmp_path / "truth.parquet", skeleton(1, 4, 1), TRUTH)
-    with pytest.raises(DataError) as caught:
-        read_motion(tmp_path / "truth.parquet", SKELETON)
-    assert caught.value.source == tmp_path / "truth.parquet"
-    assert read_motion(tmp_path / "truth.parquet", TRUTH).covariance is None
