@@ -41,6 +41,7 @@ SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "http", "http
 MIN_FREE_BYTES_BESIDE_SOURCES = 1 << 30
 
 _URL = re.compile(r"(?is)(?P<scheme>[a-z][a-z0-9+.-]+):(?P<chained>:.*:)?/+(?P<rest>[^/].*)")
+_IPV6 = re.compile(r"(?i)^\[[0-9a-f:.]+\]")
 _SECRET = re.compile(r"(?i)[?&#;][^=&/]*(sig|token|key|secret|credential|passw|pwd|auth)[^=&/]*(=|&|$)")
 _REFUSED = {"PermissionError", "NoCredentialsError", "PartialCredentialsError", "TokenRetrievalError"}
 _FULL = {errno.ENOSPC, errno.EDQUOT}
@@ -55,7 +56,7 @@ def url_of(place: Path | str) -> str | None:
     if found is None or os.path.lexists(text):
         return None
     scheme, rest = found["scheme"].lower(), found["rest"].rstrip("/")
-    if found["chained"] or "::" in rest or scheme not in SCHEMES:
+    if found["chained"] or "::" in _IPV6.sub("", rest) or scheme not in SCHEMES:
         problem = f"is a kind of URL that mocap does not open (it opens {', '.join(SCHEMES)})"
         remedy = "copy the file to this machine, and give its path"
         raise DataError(f"{scheme}://...", problem, remedy, code="url-refused")
