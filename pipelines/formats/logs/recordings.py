@@ -355,11 +355,11 @@ class OpenLog:
         self.notes: list[str] = []  # on steps of the recorder's clock
         self.lost = lost
         # Numbers of the channels of a topic in each part, found once: a log may hold 60,000 topics.
-        self._channels: dict[tuple[str, ...], dict[int, list[int]]] = {}
+        self._channels: dict[tuple[str, str, str], dict[int, list[int]]] = {}
         for place, part in enumerate(parts):
             for number, channel in part.channels.items():
                 self._channels.setdefault(channel.key, {}).setdefault(place, []).append(number)
-        self._topics = {key: self._summary(*key) for key in sorted(self._channels)}
+        self._topics = self._summaries()
 
     def __enter__(self) -> OpenLog:
         return self
@@ -411,15 +411,17 @@ class OpenLog:
         return facts | {f"dropped: {cause}": count for cause, count in self.dropped.items()}
 
     def _described(self, topic: Topic) -> dict[str, object]:
-        schemas, stamps = self._messages_of(topic.name, topic.type, topic.encoding)
         facts: dict[str, object] = {"type": topic.type, "encoding": topic.encoding, "messages": topic.count}
+        channels = self._channels[(topic.name, topic.type, topic.encoding)]
         if topic.first_ns is not None and topic.last_ns is not None:
             span_ns = topic.last_ns - topic.first_ns
             facts |= {"first_ns": topic.first_ns, "last_ns": topic.last_ns}
             if span_ns:
+                parts = [(self.parts[place], own) for place, own in channels.items()]
+                stamps = np.sort(np.concatenate([part.received_ns[part.rows_of(own)] for part, own in parts]))
                 facts["rate_hz"] = round((topic.count - 1) / span_ns * 1e9, 3)
                 facts["longest_gap_s"] = round(int(np.diff(stamps).max()) / 1e9, 6)
-        for schema in schemas:
+        for schema in {self.parts[k].channels[n].schema: None for k, own in channels.items() for n in own}:
             try:
                 decoder(schema)
             except ValueError as error:
@@ -427,29 +429,19 @@ class OpenLog:
                 break
         return facts
 
-    def _messages_of(self, *key: str) -> tuple[list[Schema], Int64]:
-        """Return the schemas of a topic, each once, and its stamps of receipt, sorted."""
-        schemas: dict[Schema, None] = {}
-        stamps = [np.zeros(0, np.int64)]
-        for place, own in self._channels[key].items():
-            part = self.parts[place]
-            schemas |= dict.fromkeys(part.channels[number].schema for number in own)
-            stamps.append(part.received_ns[part.rows_of(own)])
-        return list(schemas), np.sort(np.concatenate(stamps))
-
     def take_out(self, part: LogPart, row: int, step_ns: int) -> None:
         """Take a step of the recorder's clock out of the stamps of receipt, from a row of a part on."""
         part.received_ns = part.received_ns.copy()
         part.received_ns[row:] -= step_ns
         for later in self.parts[self.parts.index(part) + 1 :]:
             later.received_ns = later.received_ns - step_ns
-        self._topics = {key: self._summary(*key) for key in self._topics}
+        self._topics = self._summaries()
 
     def messages_of(self, part: LogPart, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some topics in one part, in the order of their receipt."""
-        decoders = {}
+        decoders, wanted = {}, frozenset(topics)
         for number, channel in part.channels.items():
-            if channel.topic in topics:
+            if channel.topic in wanted:
                 try:
                     decoders[number] = decoder(channel.schema), self._topics[channel.key]
                 except ValueError:
@@ -468,10 +460,35 @@ class OpenLog:
                     continue
                 yield Message(topic, stamps[k], value)
 
-    def _summary(self, name: str, type_: str, encoding: str) -> Topic:
-        _, stamps = self._messages_of(name, type_, encoding)
-        first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
-        return Topic(name, type_, encoding, len(stamps), first, last)
+    def _summaries(self) -> dict[tuple[str, str, str], Topic]:
+        """Count the messages of all topics, and find their first and last stamps, in one pass."""
+        none = np.iinfo(np.int64)
+        spans = dict.fromkeys(sorted(self._channels), (0, none.max, none.min))
+        for part in self.parts:
+            order = np.argsort(part.table.channel, kind="stable")
+            numbers, begins = np.unique(part.table.channel[order], return_index=True)
+            if not len(numbers):
+                continue
+            received_ns = part.received_ns[order]
+            columns = (
+                numbers,
+                np.diff(begins, append=len(order)),
+                np.minimum.reduceat(received_ns, begins),
+                np.maximum.reduceat(received_ns, begins),
+            )
+            for number, count, first, last in zip(*(column.tolist() for column in columns), strict=True):
+                before = spans[part.channels[number].key]
+                spans[part.channels[number].key] = (
+                    before[0] + count,
+                    min(before[1], first),
+                    max(before[2], last),
+                )
+        return {
+            (name, type_, encoding): Topic(
+                name, type_, encoding, count, first if count else None, last if count else None
+            )
+            for (name, type_, encoding), (count, first, last) in spans.items()
+        }
 
 
 def begins_like(path: Path, magic: bytes, suffixes: Collection[str]) -> bool:

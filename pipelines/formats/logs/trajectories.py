@@ -344,12 +344,18 @@ class _Recording:
         self.log = log
         self.parts = parts
         self.starts = np.cumsum([0, *(len(part.received_ns) for part in parts)])
-        rows: dict[tuple[str, str, str], list[Int64]] = {}
-        for part, start in zip(parts, self.starts.tolist(), strict=False):
-            for number, channel in part.channels.items():
-                rows.setdefault(channel.key, []).append(part.rows_of([number]) + start)
-        every = [np.sort(np.concatenate(own)) for own in rows.values()]
-        self.densest: Int64 = max(every, key=len, default=np.zeros(0, np.int64))
+        counts: Counter[tuple[str, str, str]] = Counter()
+        for part in parts:
+            numbers, found = np.unique(part.table.channel, return_counts=True)
+            for number, count in zip(numbers.tolist(), found.tolist(), strict=True):
+                counts[part.channels[number].key] += count
+        rows = [np.zeros(0, np.int64)]
+        if counts:
+            key = max(counts, key=counts.__getitem__)
+            for part, start in zip(parts, self.starts.tolist(), strict=False):
+                own = [number for number, channel in part.channels.items() if channel.key == key]
+                rows.append(part.rows_of(own) + start)
+        self.densest: Int64 = np.sort(np.concatenate(rows))
 
     @property
     def received_ns(self) -> Int64:
