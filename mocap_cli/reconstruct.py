@@ -180,7 +180,8 @@ def print_verdict(verdict: dict[str, Any], session: Path, flight: Path | None = 
     error = "nothing was measured"
     if expected is not None:
         low, median, high = expected
-        error = f"the error is about {median:.0f} mm, in 4 of 5 flights {low:.0f} to {high:.0f} mm"
+        would = "without these doubts the error would be" if verdict["grade"] == "wrong" else "the error is"
+        error = f"{would} about {median:.0f} mm, in 4 of 5 flights {low:.0f} to {high:.0f} mm"
     say(f"{verdict['grade']}: {error}")
     for reason in verdict["why"]:
         say(f"  {reason}")

@@ -728,5 +728,5 @@ def verdict(
         "grade": grade,
         "expected_error_mm": expected,
         "why": why,
-        "next": "mocap check flight.yaml --fix" if mends else "mocap report SESSION",
+        "next": f"mocap check flight.yaml{' --fix' if mends else ''}" if doubts else "mocap report SESSION",
     }

@@ -211,6 +211,7 @@ class _PackedBody:
         known = (*joints, *(name for name, _ in derived))
         place = {name: j for j, name in enumerate(known)}
         counts = np.isfinite(self.joint[kept, ..., 0]).sum(axis=(1, 2))
+        first = len(counts) // 20  # people are found, and films begin, some pictures after the start
         return {
             "people": self.people,
             "joints": [joint_label(name) for name in joints],
@@ -218,7 +219,7 @@ class _PackedBody:
             "derived": [[place[parent] for parent in parents] for _, parents in derived],
             "bones": [[place[a], place[b], _SIDES.index(side_of(a, b))] for a, b in bones_of(known)],
             # The first time with nearly the most joints: the page opens with it, and prints it.
-            "start": int(np.argmax(counts >= 0.9 * counts.max())),
+            "start": first + int(np.argmax(counts[first:] >= 0.9 * counts[first:].max())),
             "feet": _packed(1000 * (self.feet_m[kept] - origin[2]), np.int32),
             "middle": _packed(1000 * (self.middle[kept] - origin), np.int32),
             "joint": _packed(1000 * self.joint[kept], np.int16),
