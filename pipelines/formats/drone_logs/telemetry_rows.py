@@ -29,6 +29,8 @@ _RESTART_NS = 1_000_000_000
 _AROUND = 20
 # A step of GPS time stays for this many fixes.
 _LEAST_FIXES = 5
+# Delays of fixes scatter by as much in some receivers.
+_LEAST_STEP_NS = 100_000_000
 # Beside such a step, fixes come with smaller differences in delay.
 _STEADY_NS = 200_000_000
 # Fewer intervals between changes do not show if they are regular.
@@ -275,16 +277,22 @@ def find_boots(
 
 
 def fit_gps_time(boot_ns: Int64, utc_ns: Int64) -> ClockFit | None:
-    """Fit UTC to the time since boot by its last values: a receiver learns of leap seconds in flight."""
+    """Fit UTC to the time since boot by its last values: a receiver learns of its errors in flight."""
     lead_ns = utc_ns - boot_ns
-    leaps_s = np.rint(np.diff(lead_ns) / 1e9).astype(np.int64)
     mended, steps_s = utc_ns.copy(), []
-    for k in np.flatnonzero(leaps_s).tolist():
-        sides = lead_ns[: k + 1][-_LEAST_FIXES:], lead_ns[k + 1 :][:_LEAST_FIXES] - leaps_s[k] * 1_000_000_000
-        if min(map(len, sides)) == _LEAST_FIXES and np.ptp(np.concatenate(sides)) < _STEADY_NS:
-            mended[: k + 1] += leaps_s[k] * 1_000_000_000
-            steps_s.append(float(leaps_s[k]))
+    for k in np.flatnonzero(np.abs(np.diff(lead_ns)) > _LEAST_STEP_NS).tolist():
+        before, after = lead_ns[: k + 1][-_LEAST_FIXES:], lead_ns[k + 1 :][:_LEAST_FIXES]
+        step_ns = round(float(np.median(after) - np.median(before)))
+        whole_ns = round(step_ns / 1e9) * 1_000_000_000
+        if whole_ns and abs(step_ns - whole_ns) < _STEADY_NS:
+            step_ns = whole_ns
+        apart_ns = np.ptp(np.concatenate([before, after - step_ns]))
+        if min(len(before), len(after)) == _LEAST_FIXES and apart_ns < min(_STEADY_NS, abs(step_ns) / 4):
+            mended[: k + 1] += step_ns
+            steps_s.append(round(step_ns / 1e9, 3))
     fit = fit_clock(boot_ns, mended)
+    if fit and steps_s and fit.residual_s > min(map(abs, steps_s)) / 4:  # its clock runs unevenly
+        return fit_clock(boot_ns, utc_ns)
     return fit and replace(fit, steps_s=tuple(steps_s))
 
 
