@@ -13,12 +13,9 @@ from pipelines.session.errors import CODES, DataError
 def refused(
     code: str, source: Path | str | None = None, *names: object
 ) -> Iterator[pytest.ExceptionInfo[DataError]]:
-    """Expect a DataError.
+    """Expect a DataError of a code of `CODES` about a file, folder or setting (any, if None).
 
-    Args:
-        code: its code, one of `CODES`.
-        source: the file, folder or setting at fault; None if any will do.
-        names: numbers, keys, files and codes that its line must hold, each as text.
+    `names` are numbers, keys, files and codes that its line must hold, each as text.
     """
     assert code in CODES, f"{code} is not in pipelines/session/errors.py"
     with pytest.raises(DataError) as caught:

@@ -32,13 +32,9 @@ class Fuzzed:
 
 
 def fuzz(folder: Path, inputs: int, *, seed: int = 0, names: Sequence[str] | None = None) -> Fuzzed:
-    """Read damaged copies of the seeds, the same number of each.
+    """Read damaged copies of the seeds (all by default), the same number of each, in an empty folder.
 
-    Args:
-        folder: an empty one to work in; inputs that made trouble stay below `trouble/`.
-        inputs: number of inputs.
-        seed: seed of all damage; input k does not depend on the number of inputs.
-        names: the seeds, all by default.
+    Inputs that made trouble stay below `trouble/`; input k does not depend on the number of inputs.
     """
     chosen = list(names or SEEDS)
     sources = sown(folder / "seeds", chosen)

@@ -36,13 +36,7 @@ class NotOneLineError(AssertionError):
 def read_or_refuse(path: Path, stated: str, lines: list[str] | None = None) -> tuple[int, int]:
     """Read a file in every way; count the ways that worked, and those that refused it in one line.
 
-    Args:
-        path: the file, the folder, a flight.yaml, or a session.
-        stated: the format that a user names, independent of the content.
-        lines: takes the refusals.
-
-    Raises:
-        Exception: any exception of a reader other than a refusal.
+    `stated` is a format independent of the content. `lines` takes the refusals. Other errors are raised.
     """
     read = refused = 0
     for way in _ways(path, stated):

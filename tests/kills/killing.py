@@ -105,14 +105,8 @@ def soak(
 ) -> Iterator[Killed]:
     """Kill the commands in turns, each at a random moment of its run, and run it again.
 
-    Half of the kills hit a command that writes for the first time. The other half hit one that does
-    everything again over existing results.
-
-    Args:
-        commands: from `commands_on`, in the order in which they depend on each other.
-        kills: number of kills.
-        seed: seed of the moments.
-        known_s: duration of each command (s); None measures it with another run.
+    Half of the kills hit a command that writes for the first time, half one that does everything again over
+    existing results. `commands` depend on those before; `known_s` are their durations, else measured.
     """
     moments = np.random.default_rng(seed)
     lengths, expected = {}, {}

@@ -37,14 +37,7 @@ Disk = Mapping[str, bytes | None]
 
 @dataclass(frozen=True)
 class Moment:
-    """A folder at one moment.
-
-    Attributes:
-        entries: numbers of files by relative path; None for a folder.
-        last: contents of all files until now, by number.
-        synced: contents at the last sync, of those files that were ever synced.
-        certain: True for the moment after a sync, which makes all entries last.
-    """
+    """A folder at one moment: numbers of files by path, contents until now, and what syncs made last."""
 
     entries: Mapping[str, int | None]
     last: Mapping[int, bytes]
@@ -142,14 +135,9 @@ class Recorder:
 def losses(
     trace: Sequence[Moment], choice: np.random.Generator, *, moments: int
 ) -> Iterator[tuple[int, Disk]]:
-    """Yield states that a loss of power after some moments may leave, with the number of the moment.
+    """Yield states that a loss of power after some moments may leave, each once, with the moment's number.
 
-    The same state is yielded once for one moment.
-
-    Args:
-        trace: all moments.
-        choice: chooses what is left of unsynced files, and how many changes of entries.
-        moments: the most moments; the last one is always one of them.
+    `moments` is the most moments, the last among them; `choice` draws what is left of unsynced files.
     """
     last = len(trace) - 1
     for count in sorted({*choice.permutation(last)[: moments - 1].tolist(), last}):
@@ -229,14 +217,9 @@ def cases_on(folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Ca
 
 
 def replay(folder: Path, case: Case, *, moments: int, again: int, seed: int) -> Lost:
-    """Record a command, and look at states that a loss of power may leave.
+    """Record a command in a folder that holds all it reads and writes; look at states of a loss of power.
 
-    Args:
-        folder: holds everything that the command reads and writes.
-        case: the command.
-        moments: see `losses`.
-        again: states in which the command is given again, chosen at random.
-        seed: seed of the moments, of what is left of unsynced files, and of the choice.
+    `moments` as in `losses`; in `again` states, chosen at random, the command is given again.
     """
     choice = np.random.default_rng(seed)
     case.before()

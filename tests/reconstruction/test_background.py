@@ -148,10 +148,8 @@ def nees(found: Adjusted, position: Float, rotation: Float) -> float:
 def test_a_camera_that_only_turns_gets_the_changing_part_of_its_attitudes(known: bool) -> None:
     """Expect the constant part of the log, and beside it what 0.3 px of 100 points say.
 
-    A pan of 20 deg changes the camera's axes: a rotation of the whole world by 0.3 deg that is left appears
-    as up to 0.3 sin 20 deg = 0.1 deg that changes, and is part of the constant part's error. It is measured
-    in the world. Pictures err by 0.3 px / 760 / sqrt(100) = 0.002 deg then, points that are followed for 30
-    pictures drift by some such steps.
+    A rotation of the world by 0.3 deg that is left appears as up to 0.3 sin 20 deg = 0.1 deg that changes.
+    Pictures err by 0.3 px / 760 / sqrt(100) = 0.002 deg, and points drift by some such steps.
     """
     rng = np.random.default_rng(2)
     position, rotation = turning(150)
@@ -289,11 +287,9 @@ def test_covariances_hold_for_hovering_and_flying_cameras(way_m: float) -> None:
 def test_errors_that_wander_faster_than_the_knots_do_not_spoil_attitudes(way_m: float, known: bool) -> None:
     """Expect the changing part of attitudes better than the log's by far, and covariances that hold.
 
-    Between knots half a second apart an attitude of 0.3 deg and a correlation time of 2 s strays by
-    0.3 sqrt(2 / 2 * 0.5 / 6) = 0.09 deg, or 1.1 px, which 0.3 px of 100 points show in every picture. What
-    is left is the drift over some chains of tracks, 0.002 deg each, and the constant part seen from a camera
-    that turns by 20 deg, up to 0.3 sin 20 deg = 0.1 deg: below a third of the log's. The mean of e' C^-1 e
-    is 1 for each number; the few flights and the errors that hardly change within one double it at most.
+    Between knots half a second apart they stray by 0.3 sqrt(2 / 2 * 0.5 / 6) = 0.09 deg, 1.1 px, which 0.3 px
+    of 100 points show in every picture. What is left is the drift of tracks, 0.002 deg each, and the constant
+    part seen from a camera that turns by 20 deg, up to 0.1 deg. The few flights double e' C^-1 e at most.
     """
     wandering = (
         Process(SHIFT_IN_WORLD, 0.05, correlation_s=2.0),

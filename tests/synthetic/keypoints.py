@@ -19,16 +19,10 @@ class KeypointNoise:
 
 
 def detect(pixels: Float, noise: KeypointNoise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Simulate the keypoints that a detector reports.
+    """Simulate the keypoints that a detector reports of exact pixels [..., 2], NaN where nothing can be seen.
 
-    Args:
-        pixels: [..., 2] exact pixels, NaN for joints that cannot be seen.
-        noise: the detector's errors.
-        rng: draws as many numbers for joints that are seen as for those that are not.
-
-    Returns:
-        [..., 2] px with NaN for missed joints, and [...] confidences: 0 for those, 0.7 to 1 for good
-        ones, 0.3 to 0.9 for outliers, because detectors often have high confidence in wrong keypoints.
+    Returns [..., 2] px with NaN for missed joints, and [...] confidences: 0 for those, 0.7 to 1 for good
+    ones, 0.3 to 0.9 for outliers, because detectors often have high confidence in wrong keypoints.
     """
     shape = pixels.shape[:-1]
     offset = noise.pixel_px * rng.standard_normal(pixels.shape)

@@ -28,10 +28,8 @@ def write_logged_flight(
 ) -> SyntheticFlight:
     """Write a clean flight whose poses, intrinsics and frame times are in one log for each drone.
 
-    The clock that stamps the odometry of drone1 jumps by `jump_s` after three quarters of the flight.
-
-    The odometry is that of a body that carries its camera 30 degrees down on a lever arm. Pictures are
-    plain, and have the size of the lens by default.
+    The odometry is that of a body with its camera 30 degrees down on a lever arm; drone1's clock
+    jumps by `jump_s` after three quarters of the flight. Pictures are plain, of the lens's size by default.
     """
     flight = write_flight(folder, cameras=cameras, seconds=seconds, clean=True, keypoint_format="alphapose")
     for k, name in enumerate(flight.cameras):

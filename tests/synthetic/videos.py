@@ -53,17 +53,10 @@ def write_video(
     draw: Callable[[int], Picture] = bar_code,
     container_format: str | None = None,
 ) -> Path:
-    """Write one frame for each stamp; the suffix of the path is the container, MP4 with its table in front.
+    """Write one frame for each of strictly increasing stamps, in TICK_S; the suffix is the container.
 
-    Args:
-        path: the file.
-        ticks: strictly increasing stamps, in TICK_S.
-        codec: FFmpeg's name of the encoder.
-        key_every: frames from one key frame to the next.
-        b_frames: number of consecutive frames that refer to later ones.
-        turned_deg: counter-clockwise rotation that the container states.
-        draw: makes the picture of a frame; all have the same size.
-        container_format: FFmpeg's name of it, where the suffix does not tell.
+    MP4 has its table in front. `codec` and `container_format` are FFmpeg's names, `b_frames` frames in a row
+    refer to later ones, and `turned_deg` counts counter-clockwise. `draw` makes pictures of one size.
     """
     mp4 = path.suffix in {".mp4", ".mov"}
     with av.open(
