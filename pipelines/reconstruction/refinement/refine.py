@@ -40,8 +40,8 @@ from pipelines.reconstruction.refinement.system import (
 _WHOLE_TIMES, _WINDOWS, _WINDOW = 400, 3, 100
 # Learning ends after this many rounds, converged or not.
 _LEARNING_ROUNDS = 8
-# Estimates converge in fewer rounds.
-_ROUNDS = 8
+# Most estimates converge in eight rounds; robust weights of somebody who stands settle slowly.
+_ROUNDS = 30
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
 # Lengths between keypoints vary by this much before they are learned.
 _BONE_SIGMA_M = 0.02
