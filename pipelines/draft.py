@@ -33,7 +33,7 @@ from pipelines.drafting.found import (
     label_of_place,
 )
 from pipelines.drafting.manifest_text import flow, one_line, write_manifest
-from pipelines.drafting.matching import Ask, MotionMatch, match
+from pipelines.drafting.matching import Ask, MotionMatch, leave_open, match
 from pipelines.drafting.motion import TrackedPoints, explain_motion, explains_better
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_records import recordings_of
@@ -150,7 +150,7 @@ def draft(
     output: Path | None = None,
     *,
     overwrite: bool = False,
-    ask: Ask = lambda _: None,
+    ask: Ask = leave_open,
     progress: Progress | None = None,
 ) -> Drafted:
     """Examine files and folders and write the manifest of their flight.

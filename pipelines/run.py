@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pipelines.draft import draft, leave_out, must_be_drafted
 from pipelines.drafting.manifest_text import one_line
-from pipelines.drafting.matching import Answer, Ask, Question
+from pipelines.drafting.matching import Answer, Ask, Question, leave_open
 from pipelines.ingest import Ingested, ingest
 from pipelines.reconstruct import Reconstructed, reconstruct
 from pipelines.replan import replan
@@ -28,9 +28,7 @@ class Ran:
     warnings: list[str]
 
 
-def run(
-    folder: Path, *, ask: Ask = lambda _: None, workers: int = 1, progress: Progress | None = None
-) -> Ran:
+def run(folder: Path, *, ask: Ask = leave_open, workers: int = 1, progress: Progress | None = None) -> Ran:
     """Draft the manifest of a folder if it has none, then ingest, reconstruct, replan and report the flight.
 
     Planners are compared where the flight has a map and somebody who was logged. What is finished is skipped.

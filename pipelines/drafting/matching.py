@@ -105,6 +105,10 @@ Ask = Callable[[Question], Answer | None]
 """Answer to a question; None leaves it open."""
 
 
+def leave_open(_: Question) -> None:
+    """Leave a question open: what nothing tells is missing."""
+
+
 @dataclass(frozen=True)
 class Chosen:
     """The candidate that was taken, and its alternatives."""

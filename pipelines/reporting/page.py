@@ -141,7 +141,8 @@ def _facts(content: SessionContent, summary: Summary, started: str) -> list[str]
         wording.plural(len(summary.cameras), "camera"),
     ]
     if summary.motion is not None:
-        facts.append(f"{len(summary.joints)} joints at {wording.whole(len(summary.motion.t_ns))} times")
+        times = summary.total / max(len(summary.joints) * len(summary.people), 1)  # also those not drawn
+        facts.append(f"{len(summary.joints)} joints at {wording.whole(times)} times")
         if len(summary.people) > 1:
             facts.append(f"{len(summary.people)} people")
     method = text(summary.metrics, "method")

@@ -549,7 +549,7 @@ class CameraSources(YamlModel):
     @model_validator(mode="after")
     def _has_pictures(self) -> CameraSources:
         if self.video is None and self.keypoints is None:
-            raise ValueError("needs a video or keypoints")
+            raise ValueError("needs a video or keypoints: write video: drone1.mp4 or keypoints: drone1.json")
         if self.pose.of == "body" and not self.is_carried:
             raise ValueError("pose is of the body: say how the camera sits on it with `mount` or `gimbal`")
         if self.pose.of == "camera" and self.is_carried:

@@ -69,7 +69,8 @@ class YamlModel(BaseModel):
     def _exactly_one(self) -> Self:
         stated = [name for name in self.one_of if getattr(self, name) not in (None, "")]
         if self.one_of and len(stated) != 1:
-            raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
+            held = f"has {' and '.join(stated)}: leave out all but one" if stated else "has none: add one"
+            raise ValueError(f"needs exactly one of {', '.join(self.one_of)}, and {held}")
         return self
 
 
@@ -125,7 +126,7 @@ def describe_problem(
         return f"{place}: must be a mapping (key: value), not {str(problem['input'])[:60]!r}"
     if problem["type"] == "too_short" and problem["ctx"]["min_length"] == 1:
         return f"{place}: needs at least one"
-    message = problem["msg"].removeprefix("Value error, ")
+    message = problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     return f"{place}: {message}" if place else message
 
 
