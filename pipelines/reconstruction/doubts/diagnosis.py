@@ -487,9 +487,10 @@ class Objective:
             before = min(self._fit(same).cost, self._cost_of_pictures(scene))
             total = min(total, score(self.trial.flight, same, self.base).total)
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
-        if tried.alternative.alike:
+        if tried.alternative.alike or tried.alternative.code == "frame_rate":
             # Then each moment is of another picture, with other errors: sums of chi^2 differ by chance.
-            chance = before * float(np.sqrt(2 / self._pictures.sum()))
+            others = [self.trial.names.index(name) for name in tried.alternative.cameras]
+            chance = before * float(np.sqrt(2 * self._pictures[others].sum()) / self._pictures.sum())
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
         return Compared(*scores, self._rays(before, described), self._rays(cost, scene))
