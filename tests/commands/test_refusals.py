@@ -260,18 +260,6 @@ def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFli
     assert content(tmp_path / "flight.session") == before
 
 
-@pytest.mark.parametrize(("escape", "held"), [(r"\0", "\0"), (r"\ud800", "\ud800")])
-def test_text_that_no_name_of_a_file_can_hold(flight: SyntheticFlight, escape: str, held: str) -> None:
-    text = flight.manifest.read_text(encoding="utf-8")
-    flight.manifest.write_text(text.replace("drone1.tum", f'"drone1{escape}.tum"', 1), encoding="utf-8")
-    line = refused("ingest", flight.manifest)
-    assert line.startswith(f"mocap: {flight.manifest}: cameras.drone1.pose.file: ")
-    assert (
-        repr(f"drone1{json.loads(chr(34) + escape.replace(chr(92) + '0', chr(92) + 'u0000') + chr(34))}.tum")
-        in line
-    )
-
-
 HUGE = "0x" + "f" * 5000  # Python refuses to print it
 
 
