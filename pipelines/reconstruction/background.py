@@ -94,7 +94,7 @@ _SETTLE_ROUNDS = 8
 _INVERSE_DEPTH = np.array([0.0, 0.01])  # mean (1/m) and precision (m^2) of the prior: farther than 1 m
 # A static background moves against itself by less.
 _WORST_PX = 2.0
-_ROUNDS, _CONVERGED = 8, (3e-4, 3e-5)  # m, rad: a tenth of what their posteriors leave
+_ROUNDS, _CONVERGED = 20, (3e-4, 3e-5)  # m, rad: a tenth of what their posteriors leave
 # Poses that are farther from the log than this contradict it.
 _SIGMAS = 4.0
 # Slow errors are linear between knots this far apart; what they do in between counts as white.

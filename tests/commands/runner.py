@@ -104,9 +104,9 @@ def refused(*arguments: str | Path, code: str | None = None) -> str:
 
 
 def refusal(done: subprocess.CompletedProcess[str]) -> str:
-    """Check that a command refused its input in one line and exited 1; return that line."""
+    """Check that a command refused its input in one line, after warnings, and exited 1; return that line."""
     assert done.returncode == 1, (done.returncode, done.stdout, done.stderr)
-    lines = done.stderr.strip().splitlines()
+    lines = [line for line in done.stderr.strip().splitlines() if not line.startswith("warning: ")]
     assert all(line.startswith("  ") for line in lines[1:]), done.stderr
     assert lines[0].startswith("mocap: ")
     assert "Traceback" not in done.stderr
