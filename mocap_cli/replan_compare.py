@@ -216,3 +216,4 @@ def _print_filmed(metrics: dict[str, Any]) -> None:
         ]
     )
     say(metrics["verdict"])
+    say(f"modelled over these pictures, with the same pose errors: {metrics['modelled_verdict']}")

@@ -21,13 +21,16 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.noise import NoiseModel
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
-from pipelines.planning.comparison import common_frames, figures_of, filmed_verdict, judge
+from pipelines.planning.comparison import common_frames, figures_of, filmed_verdict, judge, verdict
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField, distance_field, in_turn
 from pipelines.planning.formation import TILT, slot_of
-from pipelines.planning.replay import MeasuredJoints, joined, known_from, poses_from
+from pipelines.planning.replay import CameraPaths, MeasuredJoints, joined, known_from, measure, poses_from
 from pipelines.planning.scene import LoggedFlight, load_flight
 from pipelines.reconstruction.refining import refined_points
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
+from pipelines.session.maps import load_maps
 from pipelines.session.people import LoggedActor, logged_people
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
@@ -35,7 +38,7 @@ from pipelines.session.registries import Detector, find_detector, hashes_of_mode
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import SIMULATION_MARK, hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import REPLAN, TRUTH, motion_table, read_table, write_table
-from pipelines.simulation.detector_errors import see
+from pipelines.simulation.detector_errors import detect_by_model, filmed_errors, see
 from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
@@ -47,7 +50,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=11)
+FILM = Stage("film", revision=12)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -161,6 +164,10 @@ def film(
         )
         metrics: dict[str, dict[str, Any]] = {}
         errors: dict[str, MeasuredJoints] = {}
+        modelled: dict[str, MeasuredJoints] = {}
+        unknown = description.map.unknown if description.map else "free"
+        maps = load_maps(folder) if description.map else []
+        fields = [distance_field(one, unknown=unknown) for one in sorted(maps, key=lambda one: one.from_ns)]
         for name, arm in arms.items():
             parts = [
                 run.chunk(f"{name}-{camera}", partial(_film_camera, arm, k, renderer, detector, progress))
@@ -173,6 +180,7 @@ def film(
             ]
             points = np.stack([own for own, _, _ in measured], axis=1)
             errors[name] = joined([of_draws for _, of_draws, _ in measured])
+            modelled[name] = _modelled(arm, fields, settings, seed=seed)
             each = [own for _, _, own in measured]
             by_person = dict(zip((who.name for who in setting.people), each, strict=True))
             metrics[name] = each[0] if len(each) == 1 else _means(each) | {"by_person": by_person}
@@ -182,7 +190,7 @@ def film(
         for name, own in errors.items():
             metrics[name]["reconstruction_error"] = figures_of(own, None, shared, t_ns)
         breaking = {name for name, arm in replanned["arms"].items() if any(arm["limit_violations"].values())}
-        best = judge(errors, breaking, t_ns)
+        best, expected = judge(errors, breaking, t_ns), judge(modelled, breaking)
         figures = jsonable(
             {
                 "schema": 1,
@@ -193,6 +201,8 @@ def film(
                 "arms": metrics,
                 "best": best,
                 "verdict": filmed_verdict(best, replanned["best"], list(metrics)),
+                "modelled": expected,
+                "modelled_verdict": verdict(expected, list(metrics)),
             }
         )
         write_json(run.folder / "metrics.json", figures)
@@ -390,6 +400,34 @@ def _measured(
     )
     known = int(np.isfinite(of.joints[..., 0]).sum())
     return points, MeasuredJoints(off_m, known), figures | {"fallback": doubt}
+
+
+def _modelled(
+    arm: _Arm, fields: Sequence[DistanceField], settings: FilmSettings, *, seed: int
+) -> MeasuredJoints:
+    """Measure an arm as `replan` models it, over the film's pictures and with the film's errors of poses."""
+    count, middles = len(arm.names), [of.motion.root for of in arm.people]
+    found = []
+    for p, of in enumerate(arm.people):
+        others = middles[:p] + middles[p + 1 :]
+        paths = CameraPaths(
+            t_ns=arm.t_ns,
+            position=arm.seen_by.position,
+            quaternion_xyzw=arm.seen_by.quaternion_xyzw,
+            known=arm.known,
+            intrinsics=[arm.seen_by.lens] * count,
+            noise=[arm.noise] * count,
+            joints=of.joints,
+            middle=middles[p],
+            person=p,
+            others=np.stack(others) if others else None,
+        )
+        errors = filmed_errors(settings.detector)
+        detect = partial(detect_by_model, joints=of.person.joints, errors=errors, rate_hz=settings.rate_hz)
+        start_m = PlannerConfig().tuning.sight_start_m
+        maps = in_turn(fields, arm.t_ns)
+        found.append(measure(paths, maps, detect, start_m=start_m, trials=DRAWS, seed=seed))
+    return joined(found)
 
 
 def _means(each: Sequence[dict[str, Any]]) -> dict[str, Any]:

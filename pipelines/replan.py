@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 
 from pipelines.formats.common.files import read_yaml
-from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.comparison import ArmResult, compare
 from pipelines.planning.config import ErrorModel, Imperfections
@@ -53,18 +52,15 @@ from pipelines.session.yaml_files import plain_yaml
 from pipelines.simulation.detector_errors import (
     ANY_JOINT,
     MEDIAN_PER_SIGMA,
-    MODELLED,
-    detect_keypoints,
+    PERSON_HEIGHT_M,
+    detect_by_model,
     errors_of,
+    filmed_errors,
     read_errors,
-    view_of,
 )
 from pipelines.simulation.scenario import DetectorErrors
 
-REPLAN_STAGE = Stage("replan", revision=13)
-
-# The detector's errors were measured by the size of a person of this height in the picture.
-PERSON_HEIGHT_M = 1.75
+REPLAN_STAGE = Stage("replan", revision=14)
 
 _SKELETON = "reconstruct/skeleton.parquet"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -213,7 +209,7 @@ def inputs_of(session: WritableSession) -> tuple[Description, StageRecord | None
     if reconstructed is not None:
         inputs[_SKELETON] = reconstructed.outputs[_SKELETON]
     errors = detector_errors(session)
-    if errors != DetectorErrors():
+    if errors != filmed_errors(None):
         inputs["errors of the detector"] = sha256_of(errors_of(errors.detector))
     return description, reconstructed, inputs
 
@@ -222,7 +218,7 @@ def detector_errors(session: WritableSession) -> DetectorErrors:
     """Choose the errors of the detector that ran on the session's pictures, if measured; else the default."""
     detected = session.record("detect")
     name = None if detected is None else detected.settings["detector"]
-    return DetectorErrors(detector=name) if name in MODELLED else DetectorErrors()
+    return filmed_errors(name)
 
 
 def error_model(errors: DetectorErrors, joints: tuple[str, ...]) -> ErrorModel:
@@ -276,29 +272,13 @@ def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> 
     return list(dict.fromkeys(asked))
 
 
-def detect_by_model(
-    pixels: Float,
-    free: np.ndarray[Any, np.dtype[np.bool_]],
-    camera: Float,
-    target: Float,
-    focal_px: float,
-    rng: np.random.Generator,
-    *,
-    joints: tuple[str, ...],
-    errors: DetectorErrors,
-) -> tuple[Float, Float]:
-    """Simulate the detector by a model with tilt and distance (`replay.Detect`)."""
-    tilt_deg, height_px = view_of(camera, target, height_m=PERSON_HEIGHT_M, focal_px=focal_px)
-    return detect_keypoints(
-        pixels, free, tilt_deg, height_px, errors, rng, joints=joints, rate_hz=PICTURES_HZ
-    )
-
-
 def fly_and_measure(scene: ReplayScene, errors: DetectorErrors, arm: str, folder: Path) -> None:
     """Fly one arm and measure from its cameras; write everything that the comparison needs to the folder."""
     flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
-    measured = measure_arm(scene, flown, partial(detect_by_model, joints=joints, errors=errors))
+    measured = measure_arm(
+        scene, flown, partial(detect_by_model, joints=joints, errors=errors, rate_hz=PICTURES_HZ)
+    )
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
     np.save(folder / "aim.npy", flown.aim)
     facts: dict[str, object] = {"safety": flown.safety, "joint_frames": 0}

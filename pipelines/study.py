@@ -94,7 +94,7 @@ from pipelines.simulation.walks import (
 )
 
 # It is raised whenever the same study gives other figures than before.
-_REVISION = 11
+_REVISION = 12
 # A study with more combinations would take days.
 _MAX_CELLS = 500
 _COMMA = r",(?![^\[]*\])"  # not between brackets
@@ -110,6 +110,7 @@ _UNDIVIDED = ("config",)  # variables whose value may hold commas
 _SPEEDS, _MOST_DELAY_S, _MOST_TURN_DEG = (0.7, 1.4), 3.0, 60.0
 # A way that is turned into obstacles so often is not turned at all.
 _MOST_TRIES = 50
+_IMPERFECTION = "imperfections."  # variables that nobody chooses
 _SETTINGS = {"range_m": "radius_m", "tilt_deg": "tilt_deg"}  # variables with the names of planner settings
 
 Stated = Mapping[str, tuple[str, ...]]
@@ -386,13 +387,14 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
                 groups = _by_combination(rows)
                 rows = [_over_walks([every[k] for k in own]) for own in groups]
                 capped = [np.array([capped[k].mean() for k in own]) for own in groups]
-            best = _mark_tradeoff(rows, capped)
+            best = [_mark_tradeoff(rows, capped, own) for own in _by_condition(rows)]
             if len(walks) > 1:
                 for row, group in zip(rows, groups, strict=True):
                     for k in group:
                         every[k] |= {"best": row["best"], "tradeoff": row["tradeoff"]}
                 by_walk = [[places[k] for k in own] for own in groups]
-                best["walks"] = [_count_walks(by_walk[best["cell"]], own) for own in by_walk]
+                for one in best:
+                    one["walks"] = [_count_walks(by_walk[one["cell"]], own) for own in by_walk]
             metrics = {
                 "kind": "session",
                 "varied": [name for name in varied if name != "actor"],
@@ -402,7 +404,7 @@ def _study_session(stated: Stated, place: Path, store: Store, progress: Progress
                 "keypoints": f"modelled after {errors.detector}",
                 "best": best,
                 "cells": rows,
-                "verdict": _verdict(rows, best),
+                "verdict": ". ".join(_verdict(rows, one) for one in best),
                 "warnings": [*flight.warnings, *few_trials(settings.trials), *_doubts(scenes, maps)],
             }
             return metrics, every
@@ -620,10 +622,26 @@ def _figures(
     }
 
 
-def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any]) -> dict[str, Any]:
-    """Mark the best combination and the trade-off; return the best and those that are alike."""
-    kept = [k for k, row in enumerate(rows) if not row["violations"]] or list(range(len(rows)))
+def _condition(row: Row) -> str:
+    """Name the imperfections under which a combination was flown: nobody chooses them, so none is best."""
+    stated = (f"{name}={row[name]}" for name in row if name.startswith(_IMPERFECTION))
+    return ", ".join(stated)
+
+
+def _by_condition(rows: Sequence[Row]) -> list[list[int]]:
+    """Group rows that were flown under the same imperfections."""
+    groups: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        groups.setdefault(_condition(row), []).append(k)
+    return list(groups.values())
+
+
+def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], cells: Sequence[int]) -> dict[str, Any]:
+    """Mark the best of some cells and the trade-off; return the best and those that are alike."""
+    kept = [k for k in cells if not rows[k]["violations"]] or list(cells)
     best = min(kept, key=lambda k: float(rows[k]["capped_mm"]))
+    if len(cells) < 2:
+        return {"cell": best, "cells": list(cells), "alike": []}
     rows[best]["best"] = True
 
     def costs(k: int) -> tuple[float, float, float]:
@@ -642,33 +660,35 @@ def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any]) -> dict[st
             continue
         if found["mean"] < SMALLEST_DIFFERENCE_MM or (found["interval"] and found["interval"][0] <= 0.0):
             alike.append(k)
-    return {"cell": best, "alike": alike}
+    return {"cell": best, "cells": list(cells), "alike": alike}
 
 
-def _verdict(rows: Sequence[dict[str, Any]], best: dict[str, Any]) -> str:
-    own = rows[best["cell"]]
+def _verdict(rows: Sequence[Row], best: Mapping[str, Any]) -> str:
+    own, group = rows[best["cell"]], [rows[k] for k in best["cells"]]
     ends = "" if own["low_mm"] is None else f" [{own['low_mm']:.1f}, {own['high_mm']:.1f}]"
+    under = f"With {condition} " if (condition := _condition(own)) else ""
+    winner = "best is " if len(group) > 1 else ""
     words = [
-        f"best is {_named(own)}: {own['capped_mm']:.1f}{ends} mm over all joints,"
+        f"{under}{winner}{_named(own)}: {own['capped_mm']:.1f}{ends} mm over all joints,"
         f" {100 * own['pck150']:.1f} % within 150 mm,"
         f" {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
     ]
     if best["alike"]:
         start = "On average no" if "walks" in best else "No"
-        words.append(
-            f"{start} difference worth flying to {'; '.join(_named(rows[k], rows) for k in best['alike'])}"
-        )
-    for k, counts in enumerate(best.get("walks", ())):
+        alike = "; ".join(_named(rows[k], group) for k in best["alike"])
+        words.append(f"{start} difference worth flying to {alike}")
+    for k in best["cells"] if "walks" in best else ():
         if k != best["cell"]:
+            counts = best["walks"][k]
             share = _share_interval(counts["better"], counts["walks"])
             words.append(
-                f"It is better than {_named(rows[k], rows)} in {counts['better']} of {counts['walks']} walks"
+                f"It is better than {_named(rows[k], group)} in {counts['better']} of {counts['walks']} walks"
                 f" (95 % interval: {share}), worse in {counts['worse']}"
             )
-    least = min((row for row in rows if row["tradeoff"]), key=lambda row: float(row["path_m"]))
+    least = min((row for row in group if row["tradeoff"]), key=lambda row: float(row["path_m"]), default=own)
     if least is not own:
         words.append(
-            f"Shortest is {_named(least, rows)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm"
+            f"Shortest is {_named(least, group)}: {least['path_m']:.0f} m, {least['capped_mm']:.1f} mm"
         )
     return ". ".join(words)
 
@@ -688,6 +708,11 @@ def _named(row: dict[str, Any], among: Sequence[dict[str, Any]] = ()) -> str:
         "range_m": f" from {row['range_m']:g} m",
         "tilt_deg": f" at {row['tilt_deg']:g} deg",
         "robots": f" with {row['robots']} drones",
-    } | {name: f", {name}={value}" for name, value in row.items() if name not in usual}
+    }
+    words |= {
+        name: f", {name}={value}"
+        for name, value in row.items()
+        if name not in usual and not name.startswith(_IMPERFECTION)
+    }
     shown_names = [name for name in words if not among or len({str(other[name]) for other in among}) > 1]
     return f"{row['arm']}" + "".join(words[name] for name in shown_names)

@@ -321,6 +321,8 @@ FARTHEST_M = 100.0
 LEAST_INFORMATION = 1e-6
 # And so does this share of the stiffness, where that is larger.
 LEAST_OF_STIFFNESS = 1e-10
+# One random stream for each: poses err alike in every measurement, however many numbers a detector draws.
+POSES, KEYPOINTS = range(2)
 # Keypoints below this confidence are left out, as in `mocap reconstruct`.
 MIN_CONFIDENCE = 0.3
 
@@ -485,13 +487,14 @@ class Detect(Protocol):
         free: Bool,
         camera: Float,
         target: Float,
+        skeleton: Float,
         focal_px: float,
         rng: np.random.Generator,
     ) -> tuple[Float, Float]:
         """Return keypoints [T, J, 2] px (NaN: missed) and confidences [T, J] of exact pixels.
 
         `free` [T, J] is where nothing hides the joint, `camera` and `target` (the person's middle) are [T, 3]
-        m, world. As many random numbers are drawn for any visibility.
+        m, world, the `skeleton` [T, J, 3]. As many random numbers are drawn for any visibility.
         """
 
 
@@ -555,15 +558,14 @@ def measure(
         weight = np.empty((times, count, cameras))
         logged_position, logged_rotation = np.empty((times, cameras, 3)), np.empty((times, cameras, 3, 3))
         for i, lens in enumerate(paths.intrinsics):
-            rng = np.random.default_rng([seed, trial, i])
             path = paths.position[i]
             logged_position[:, i], turned = disturb(
-                paths.noise[i], paths.t_ns, path, paths.quaternion_xyzw[i], rng
+                *(paths.noise[i], paths.t_ns, path, paths.quaternion_xyzw[i]),
+                np.random.default_rng([seed, POSES, trial, i]),
             )
             logged_rotation[:, i] = matrix_from_quaternion(turned)
-            if paths.person:
-                rng = np.random.default_rng([seed, trial, i, paths.person])
-            xy, confidence = detect(pixels[i], free[i], path, paths.middle, _focal(lens), rng)
+            rng = np.random.default_rng([seed, KEYPOINTS, trial, i, paths.person])
+            xy, confidence = detect(pixels[i], free[i], path, paths.middle, joints, _focal(lens), rng)
             rays[:, :, i] = undistort(xy, lens)
             weight[:, :, i] = np.where(confidence >= MIN_CONFIDENCE, confidence, 0.0)
         views = Views(

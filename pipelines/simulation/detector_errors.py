@@ -44,6 +44,16 @@ BlazePose fills in the joints of people of whom it sees half. Measured on 20,000
 1,280 of them behind walls, mounds and trees, in eleven worlds.
 """
 
+SIDES_DEG = (0.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
+SIDE_FACTOR = (0.6, 0.72, 0.95, 1.12, 1.03, 0.97, 0.85)
+"""Angle between the direction that a person faces and the camera, and the factor of errors seen from there.
+
+Medians of the same pictures: BlazePose is best from the front, and worst from the side.
+"""
+
+LASTING_SHARE = 0.5
+"""Share of the variance of a joint's error that lasts while it is seen from one side, in those pictures."""
+
 OUTLIER_SHARES = (0.2, 1.0)
 """Distance of an outlier from the truth, in heights of the person: least and most."""
 
@@ -55,13 +65,19 @@ SWAP_FRAMES = (2, 6)
 # does: the area under the ROC curve is 0.84 to 0.90 over tilts of 60 to 15 degrees, measured was 0.88.
 _CONFIDENCE_RANGE, _CONFIDENCE_NOISE, _OUTLIER_DOUBT = 0.14, 0.05, 0.3
 
+# The size of a detector's errors is that of a person of this height in the picture.
+PERSON_HEIGHT_M = 1.75
+
+FILMED_MISSED, FILMED_OUTLIERS = 0.003, 0.0005
+"""Shares of visible joints that are missed and outliers at `REFERENCE_TILT_DEG`, in those pictures."""
+
 MEDIAN_PER_SIGMA = float(np.sqrt(2 * np.log(2)))
 """Median length of a keypoint's error over the standard deviation of a coordinate (Rayleigh)."""
 
 _LIMBS = (("elbow", "wrist", "pinky", "index", "thumb"), ("knee", "ankle", "heel", "big_toe", "small_toe"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ErrorTable:
     """Measured errors by joint (`ANY_JOINT` for all others) and tilt."""
 
@@ -75,6 +91,12 @@ class ErrorTable:
             for k in range(3):
                 values[k, :, j] = np.interp(tilt_deg, table[:, 0], table[:, k + 1])
         return values[0], values[1], values[2]
+
+
+@lru_cache(maxsize=4)
+def _usual_missed(table: ErrorTable, joints: tuple[str, ...]) -> float:
+    usual = table.at(np.array([REFERENCE_TILT_DEG]), joints)[1]
+    return max(float(usual.mean()) if usual.size else 0.0, _LEAST_MISSED)
 
 
 def errors_of(detector: str) -> Path:
@@ -113,6 +135,49 @@ def view_of(camera: Float, target: Float, *, height_m: float, focal_px: float) -
     return np.degrees(np.arcsin(away[..., 2] / distance)), focal_px * height_m / distance
 
 
+def side_of(away: Float, skeleton: Float, joints: tuple[str, ...]) -> Float:
+    """Compute from which side [T] a camera sees a person, in degrees from the front; NaN where unknown.
+
+    `away` [T, 3] points from the person to the camera, the `skeleton` is [T, J, 3] m, world.
+    """
+    if not {"left_hip", "right_hip"} <= set(joints):
+        return np.full(len(away), np.nan)
+    across = skeleton[:, joints.index("left_hip")] - skeleton[:, joints.index("right_hip")]
+    front = np.stack([across[:, 1], -across[:, 0]], axis=-1)
+    along, beside = (front * away[:, :2]).sum(-1), front[:, 0] * away[:, 1] - front[:, 1] * away[:, 0]
+    side_deg: Float = np.degrees(np.abs(np.arctan2(beside, along)))
+    return side_deg
+
+
+def filmed_errors(detector: str | None) -> DetectorErrors:
+    """Return the errors of a detector on rendered pictures, or of the usual one if it was not measured."""
+    usual = DetectorErrors(missed_share=FILMED_MISSED, outlier_share=FILMED_OUTLIERS)
+    return usual.model_copy(update={"detector": detector}) if detector in MODELLED else usual
+
+
+def detect_by_model(
+    pixels: Float,
+    free: Bool,
+    camera: Float,
+    target: Float,
+    skeleton: Float,
+    focal_px: float,
+    rng: np.random.Generator,
+    *,
+    joints: tuple[str, ...],
+    errors: DetectorErrors,
+    rate_hz: float,
+) -> tuple[Float, Float]:
+    """Simulate the detector by a model with tilt, distance and side (`replay.Detect`)."""
+    tilt_deg, height_px = view_of(camera, target, height_m=PERSON_HEIGHT_M, focal_px=focal_px)
+    return detect_keypoints(
+        *(pixels, free, tilt_deg, height_px, errors, rng),
+        joints=joints,
+        rate_hz=rate_hz,
+        side_deg=side_of(camera - target, skeleton, joints),
+    )
+
+
 def detect_keypoints(
     pixels: Float,
     visible: Bool,
@@ -124,6 +189,7 @@ def detect_keypoints(
     joints: tuple[str, ...],
     table: ErrorTable | None = None,
     rate_hz: float = MODELLED_HZ,
+    side_deg: Float | None = None,
 ) -> tuple[Float, Float]:
     """Simulate the keypoints [T, J, 2] px of one person, NaN where missed, and confidences [T, J], then 0.
 
@@ -137,12 +203,12 @@ def detect_keypoints(
 
     The exact pixels are NaN for joints outside the picture; `visible` [T, J] is False where something hides
     one, and takes no part in the random numbers. Frames are `rate_hz` a second. `table` is that of
-    `errors.detector` by default.
+    `errors.detector` by default. With sides [T] in degrees errors depend on them, too (`SIDE_FACTOR`), and a
+    part of each joint's error lasts (`LASTING_SHARE`).
     """
     table = read_errors(errors_of(errors.detector)) if table is None else table
     median_share, measured_missed, mean_confidence = table.at(tilt_deg, joints)
-    _, usual, _ = table.at(np.array([REFERENCE_TILT_DEG]), joints)
-    growth = measured_missed / max(float(usual.mean()) if usual.size else 0.0, _LEAST_MISSED)
+    growth = measured_missed / _usual_missed(table, joints)
 
     shape = pixels.shape[:2]
     unit_error = _correlated(shape, KEPT_PER_FRAME ** (MODELLED_HZ / rate_hz), rng)
@@ -159,6 +225,11 @@ def detect_keypoints(
         outlier, swapped = np.zeros_like(outlier), np.zeros_like(swapped)
 
     sigma_px = errors.scale * apparent_height_px[:, None] * median_share / MEDIAN_PER_SIGMA
+    if side_deg is not None:
+        lasting = rng.standard_normal((1, *unit_error.shape[1:]))
+        unit_error = np.sqrt(1.0 - LASTING_SHARE) * unit_error + np.sqrt(LASTING_SHARE) * lasting
+        factor = np.interp(side_deg, SIDES_DEG, SIDE_FACTOR)
+        sigma_px = sigma_px * np.where(np.isnan(factor), 1.0, factor)[:, None]
     ordinary = unit_error * (sigma_px * np.where(visible, 1.0, hidden[1]))[..., None]
     gross = (far * apparent_height_px[:, None])[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     found = pixels + np.where(outlier[..., None], gross, ordinary)
@@ -177,9 +248,9 @@ def detect_keypoints(
 def _correlated(shape: tuple[int, ...], kept: float, rng: np.random.Generator) -> Float:
     """Draw unit normal errors [T, J, 2], each joint's correlated with those of the frame before."""
     error = rng.standard_normal((*shape, 2))
-    fresh = np.sqrt(1 - kept**2)
+    error[1:] *= np.sqrt(1 - kept**2)
     for k in range(1, len(error)):
-        error[k] = kept * error[k - 1] + fresh * error[k]
+        error[k] += kept * error[k - 1]
     return error
 
 

@@ -242,8 +242,9 @@ def test_a_verdict_says_in_how_many_other_walks_it_holds(calm: Path, tmp_path: P
     done = run(*grid, "-o", tmp_path / "out", "--json")
     assert done.exit_code == 0, done.stderr
     metrics = json.loads(done.stdout)
-    assert (metrics["walks"], len(metrics["cells"]), metrics["best"]["cell"]) == (3, 2, 0)
-    assert metrics["best"]["walks"][1] == {"better": 3, "worse": 0, "walks": 3}
+    (best,) = metrics["best"]
+    assert (metrics["walks"], len(metrics["cells"]), best["cell"]) == (3, 2, 0)
+    assert best["walks"][1] == {"better": 3, "worse": 0, "walks": 3}
     assert "3 of 3" in metrics["verdict"]
     with (tmp_path / "out" / "table.csv").open(encoding="utf-8") as file:
         paths = {row["actor"]: row["path_m"] for row in csv.DictReader(file) if float(row["range_m"]) == 8}

@@ -193,18 +193,15 @@ LENS = Intrinsics(1280, 720, 760.0, 760.0, 639.5, 359.5)
 TIMES, JOINTS = 40, 5
 
 
-def exact(
-    pixels: Float, free: Bool, camera: Float, target: Float, focal_px: float, rng: np.random.Generator
-) -> tuple[Float, Float]:
+def exact(pixels: Float, free: Bool, *_: Any) -> tuple[Float, Float]:
     """Detect without errors every joint that is not hidden."""
     found = np.where(free[..., None], pixels, np.nan)
     return found, np.isfinite(found[..., 0]).astype(np.float64)
 
 
-def two_pixels_off(
-    pixels: Float, free: Bool, camera: Float, target: Float, focal_px: float, rng: np.random.Generator
-) -> tuple[Float, Float]:
-    found, confidence = exact(pixels, free, camera, target, focal_px, rng)
+def two_pixels_off(pixels: Float, free: Bool, *others: Any) -> tuple[Float, Float]:
+    found, confidence = exact(pixels, free)
+    rng: np.random.Generator = others[-1]
     return found + rng.normal(0, 2.0, found.shape), confidence
 
 
