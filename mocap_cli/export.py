@@ -8,7 +8,7 @@ import click
 
 from mocap_cli.options import FiniteRange, Shown, any_path, output_options, overwrite_option
 from mocap_cli.several import each
-from mocap_cli.terminal import say, watching
+from mocap_cli.terminal import say, say_next, watching
 
 # Of more files than this only the first ones are printed.
 _LONGEST_LIST = 4
@@ -73,6 +73,7 @@ def export_command(
     earlier export are replaced; other files only with --overwrite.
     """
     from pipelines.export import PICTURES_HZ, export
+    from pipelines.session.registries import FORMATS
 
     names = [name.strip() for name in formats.split(",") if name.strip()]
     if not names:
@@ -96,6 +97,9 @@ def export_command(
         }
     _print("written", result.written)
     _print("unchanged", result.unchanged)
+    every = (*result.written, *result.unchanged)
+    readable = (path for path in every if any(kind.recognises(path) for kind in FORMATS.all()))
+    say_next("mocap info {}", next(readable, session), shown.quiet)
     return None
 
 
