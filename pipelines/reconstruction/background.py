@@ -548,7 +548,13 @@ class _Stretch:
         with a camera that does not move at all.
         """
         stands = self._standing(prior)
+        far = prior.constant[1] > _FAR_RAD
+        again = (
+            replace(self, points=BackgroundPoints(*(each.copy() for each in self.points))) if far else None
+        )
         free = self._solved(prior)
+        if again is not None and (free is None or np.median(free.missed) > _WORST_PX):
+            free = again._solved(prior, stiff=True) or free
         if stands is None or (free is not None and _misfit(stands) > _misfit(free) + _STANDS):
             return free
         return stands
@@ -599,14 +605,24 @@ class _Stretch:
         return np.asarray(self.knot_t_s[self.knot] + self.share * step)
 
     def _solved(
-        self, prior: PosePrior, *, positions_known: bool = False, level_rounds: int = _LEVEL_ROUNDS
+        self,
+        prior: PosePrior,
+        *,
+        positions_known: bool = False,
+        stiff: bool = False,
+        level_rounds: int = _LEVEL_ROUNDS,
     ) -> _SolvedStretch | None:
+        # A path that is free to bend may bend where the camera should turn: a stiff one turns first.
+        slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0])
+        stages = [(loss, prior) for loss in _WIDE]
+        if stiff:
+            stages = [(_WIDE[0], _with_position_levels(prior, prior.white[0], slow)), *stages]
         constant = np.zeros(len(_sigma_of_constants(prior)))
         state = _StretchState(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
-        for loss in _WIDE:
+        for loss, start in stages:
             settle = _SETTLE_ROUNDS if loss == _WIDE[0] else 0
             rounds = _FAR_ROUNDS if prior.constant[1] > _FAR_RAD else 2
-            found = self._solve(state, prior, rounds=rounds, loss=loss, settle=settle)
+            found = self._solve(state, start, rounds=rounds, loss=loss, settle=settle)
             if found is None:
                 return None
             state = found[0]
