@@ -132,10 +132,10 @@ def test_arms_see_with_the_errors_of_the_detector_that_the_session_used(calm: Pa
     assert errors[0] < errors[1]
 
 
-def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(
+def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_no_worse(
     at_the_mound: dict[str, Any],
 ) -> None:
-    """Require the order of the arms, with a margin; the reference is 38 deg for fixed, 17 for adaptive."""
+    """Require the order of the arms; the reference is 38 deg for fixed, 17 for adaptive."""
     metrics = at_the_mound
     arms = metrics["arms"]
     assert arms["fixed"]["tilt_deg"]["max"] > 30
@@ -149,7 +149,8 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(
     assert against_fixed["pck150"]["interval"][0] > 0
     # The ring goes through the mound: it is no candidate. PCK counts what was not measured as wrong.
     best = metrics["best"]
-    assert (best["arms"], best["disagree"], best["left_out"]) == (["adaptive"], False, ["flown"])
+    assert best["difference"]["arm"] == "adaptive"
+    assert (best["disagree"], best["left_out"]) == (False, ["flown"])
     pck = {name: arms[name]["reconstruction_error"]["pck150"]["mean"] for name in arms}
     assert best["difference"]["pck150"]["mean"] == pytest.approx(pck["adaptive"] - pck["fixed"])
     assert all(share <= arms[name]["reconstruction_error"]["coverage"]["mean"] for name, share in pck.items())
@@ -161,7 +162,7 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(
     assert metrics["warnings"][0] == first
     assert arms["flown"]["limit_violations"]["collision"] > 0
     assert first.startswith("flown ")
-    assert then.startswith("adaptive is better than fixed: ")
+    assert "adaptive less fixed: " in then  # 0.4 points: nothing worth flying with exact poses
     assert f"{against_fixed['mpjpe_mm']['mean']:+.1f} [" in then
     assert "(simulated)" in then
     for name in ("adaptive", "fixed"):
