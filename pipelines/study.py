@@ -667,7 +667,8 @@ def _verdict(rows: Sequence[Row], best: Mapping[str, Any]) -> str:
     own, group = rows[best["cell"]], [rows[k] for k in best["cells"]]
     ends = "" if own["low_mm"] is None else f" [{own['low_mm']:.1f}, {own['high_mm']:.1f}]"
     under = f"With {condition} " if (condition := _condition(own)) else ""
-    winner = "best is " if len(group) > 1 else ""
+    winner = "best is " if not best["alike"] else "least error has "
+    winner = winner if len(group) > 1 else ""
     words = [
         f"{under}{winner}{_named(own)}: {own['capped_mm']:.1f}{ends} mm over all joints,"
         f" {100 * own['pck150']:.1f} % within 150 mm,"
