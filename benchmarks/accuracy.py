@@ -1,6 +1,6 @@
 """Accuracy of the estimate: `python -m benchmarks.accuracy SUBJECT [--write]`.
 
-SUBJECT is `corpus`, or gimbals, bodies, people, attitudes or detectors, each of which is described in the
+SUBJECT is `corpus`, or films, gimbals, bodies, people, attitudes or detectors, each described in the
 module of its name. corpus: all methods on 24 rendered flights and the sample, with the real detectors
 (`benchmarks/corpus/README.md`), errors of the logs drawn anew for each draw. flight.yaml gives their true
 model, or neither it nor the logs give anything. Every method gets the same sessions by the same call as
@@ -33,6 +33,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks import attitudes, bodies, detectors, gimbals, people
+from benchmarks.corpus import making
 from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
 from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
 from benchmarks.results import fixed, markdown_table, show
@@ -428,6 +429,7 @@ def _mean(outcomes: Sequence[Outcome], name: str) -> float:
 
 SUBJECTS: dict[str, tuple[Any, Any]] = {
     "corpus": (add_arguments, run),
+    "films": (making.add_arguments, making.run),
     "gimbals": (gimbals.add_arguments, gimbals.run),
     "attitudes": (attitudes.add_arguments, attitudes.run),
     "people": (people.add_arguments, people.run),

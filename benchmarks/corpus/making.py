@@ -1,6 +1,6 @@
 """Make the corpus: film, detect with both networks, follow the background, and keep what that gives.
 
-    python -m benchmarks.corpus [--films FOLDER] [--workers N] [--refollow] [FLIGHT ...]
+    python -m benchmarks.accuracy films [--films FOLDER] [--workers N] [--refollow] [FLIGHT ...]
 
 What exists is kept, so an interrupted run goes on. `--refollow` follows the backgrounds anew, with the films
 that are in the folder. A film is removed once all of its flight is kept. The detectors must be there
@@ -10,6 +10,7 @@ that are in the folder. A film is removed once all of its flight is kept. The de
 import argparse
 import shutil
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.corpus.stored import (
@@ -31,14 +32,15 @@ from pipelines.session.tables import KEYPOINTS, TRACKS, read_table
 from pipelines.simulate import simulate
 
 
-def main() -> None:
-    """Make the flights that are not complete."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flights", nargs="*", metavar="FLIGHT", help="names; all by default")
     parser.add_argument("--films", type=Path, default=Path("build/corpus_films"))
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--refollow", action="store_true", help="follow the backgrounds anew")
-    arguments = parser.parse_args()
+
+
+def run(arguments: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
+    """Make the flights that are not complete; there is nothing to show."""
     for flight in flights():
         if arguments.flights and flight.name not in arguments.flights:
             continue
@@ -48,6 +50,7 @@ def main() -> None:
             print(f"{flight.name}: {took:.0f} s, {cpu:.0f} s of the processor", flush=True)
         for path in arguments.films.glob(f"{flight.name}*"):
             shutil.rmtree(path)
+    yield from ()
 
 
 def make(flight: Flight, films: Path, workers: int = 1, *, again: bool = False) -> bool:
@@ -105,7 +108,3 @@ def _followed(session: Path) -> dict[str, Background]:
         stills = {int(path.stem): path.read_bytes() for path in sorted(folder.glob("stills/*.jpg"))}
         backgrounds[camera] = Background(read_table(tracks_path(folder), TRACKS), stills)
     return backgrounds
-
-
-if __name__ == "__main__":
-    main()
