@@ -18,7 +18,7 @@ from mocap_cli.options import (
     scheduler_option,
 )
 from mocap_cli.several import expanded
-from mocap_cli.terminal import one_line, print_json, say, watching
+from mocap_cli.terminal import one_line, print_json, say, say_next, watching
 
 if TYPE_CHECKING:
     from mocap_cli.options import ChosenPictures
@@ -133,4 +133,13 @@ def batch_command(
             say(f"written: {url_of(written) or written}")
     if failures:
         say(f"mocap: {len(failures)} of {len(result.rows)} flights failed", err=True)
+    if not shown.as_json:
+        odd = next((k for k, row in enumerate(result.rows) if row.error is not None or row.doubt), None)
+        is_reconstructed = "reconstruct" in settings.stages
+        follows = "mocap export {} --to trc,angles" if is_reconstructed else "mocap reconstruct {}"
+        follows, place = (
+            (follows, result.sessions[0]) if odd is None else ("mocap check {}", result.flights[odd])
+        )
+        say_next(follows, url_of(place) or place, shown.quiet)
+    if failures:
         context.exit(1)

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from mocap_cli.options import Shown, any_path, force_option, output_options, overwrite_option, workers_option
-from mocap_cli.terminal import print_json, print_table, say, say_warnings, watching
+from mocap_cli.terminal import print_json, print_table, say, say_next, say_warnings, watching
 
 
 @click.command("study", short_help="Study an error against tilt, range, drones, noise, settings.")
@@ -72,3 +72,9 @@ def study_command(
             say()
             say(metrics["verdict"])
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
+    if not places:
+        say_next("mocap simulate --example mound_walk -o {}", Path("mound_walk"), shown.quiet)
+    elif places[0].suffix in {".yaml", ".yml"}:
+        say_next("mocap simulate {} -o simulated", places[0], shown.quiet)
+    else:
+        say_next("mocap replan-compare {}", places[0], shown.quiet)

@@ -135,7 +135,7 @@ def _noting_compilation(notes: _Notes) -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def say_next(command: str, place: Path, quiet: bool) -> None:
+def say_next(command: str, place: Path | str, quiet: bool) -> None:
     """Print the next command of the user's way, as the last line; `{}` in it stands for a path."""
     if quiet:
         return

@@ -80,7 +80,9 @@ class Outcome:
 class Batch:
     """Result of a batch."""
 
-    rows: tuple[FlightRow, ...]
+    flights: tuple[Path, ...]
+    sessions: tuple[Path, ...]
+    rows: tuple[FlightRow, ...]  # one for each flight
     unchanged: int  # flights for which no stage had anything to do
     table: Path
     page: Path
@@ -126,7 +128,7 @@ def batch(
     rows = tuple(_row(folder, job, outcomes[k]) for k, job in enumerate(jobs))
     _store(folder, rows)
     unchanged = sum(outcome.unchanged for outcome in outcomes.values())
-    return Batch(rows, unchanged, folder / _TABLE, folder / _PAGE)
+    return Batch(tuple(flights), tuple(sessions), rows, unchanged, folder / _TABLE, folder / _PAGE)
 
 
 def run_flight(job: Job) -> Outcome:

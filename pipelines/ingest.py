@@ -19,7 +19,7 @@ from pipelines.drafting.found import GIMBAL, is_called
 from pipelines.formats.common.files import leads_out
 from pipelines.formats.logs.messages import kind_of
 from pipelines.geometry.arrays import Float, Intrinsics
-from pipelines.reconstruction.doubts.logs import doubts_of_logs, doubts_of_places
+from pipelines.reconstruction.doubts.logs import doubt_of_unit, doubts_of_logs, doubts_of_places
 from pipelines.reconstruction.picture_map import PictureMap
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.description import (
@@ -89,7 +89,12 @@ from pipelines.sources.pictures import open_files
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=15)
+INGEST = Stage("ingest", revision=16)
+
+_OF_ONE_CAMERA = (
+    "one camera gives a rough estimate: how far away people are is told by their stature alone; a second"
+    " drone across would measure it (mocap reconstruct says how many mm it would gain)"
+)
 
 
 @dataclass(frozen=True)
@@ -170,11 +175,18 @@ def ingest(
             check_sources()
             warnings += reader.take_notes()
             warnings += assumptions_as_warnings(flight.assumptions)
+            if len(entries) == 1:
+                warnings.append(_OF_ONE_CAMERA)
 
             tables = {name: run.folder / "cameras" / name / "poses.parquet" for name in entries}
             tracks = {name: trajectory_from(read_table(path, POSES)) for name, path in tables.items()}
-            doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
-            doubts += doubts_of_places(tracks, reader.map_box) + reader.poses.map_doubts + unused
+            units = {name: camera.pose.unit for name, camera in flight.cameras.items()}
+            if of_unit := doubt_of_unit(tracks, units):
+                doubts = [of_unit]  # every other place follows from it
+            else:
+                doubts = doubts_of_logs({name: (entry, tracks[name]) for name, entry in entries.items()})
+                doubts += doubts_of_places(tracks, reader.map_box)
+            doubts += reader.poses.map_doubts + unused
             warnings += [doubt.as_warning() for doubt in doubts]
 
             description = Description(

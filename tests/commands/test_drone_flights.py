@@ -264,3 +264,4 @@ def test_a_video_starts_at_the_time_of_its_container(tmp_path: Path) -> None:
     described = ingest(flight.manifest).description
     assert described.cameras["drone1"].frames.first_t_ns == int(flight.t_ns[0])
     assert any("say clock: {sigma_s: 1}" in line for line in described.warnings)
+    assert any("one camera" in line for line in described.warnings)

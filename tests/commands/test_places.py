@@ -170,6 +170,23 @@ def test_poses_that_cannot_lie_in_one_place_are_doubted(
     assert named in f"{doubt.what} {doubt.remedy}"
 
 
+@pytest.mark.parametrize(
+    ("stated", "factor", "right"), [("mm", 1, "m"), (None, 1000, "mm"), ("m", 100, "cm")]
+)
+def test_a_unit_in_which_no_team_stands_is_doubted(
+    tmp_path: Path, stated: str | None, factor: float, right: str
+) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=0.5, clean=True)
+    for k, (name, camera) in enumerate(flight.settings["cameras"].items()):
+        poses = Trajectory(flight.t_ns, factor * flight.camera_position[k], flight.camera_quaternion[k])
+        write_trajectory(tmp_path / f"{name}.tum", poses)
+        camera["pose"] = {"file": f"{name}.tum"} | ({"unit": stated} if stated else {})
+    flight.save()
+    (doubt,) = ingest(flight.manifest).description.doubts
+    assert (doubt.code, doubt.cameras) == ("unit", ["drone1", "drone2"])
+    assert doubt.remedy.endswith(f".pose.unit: {right}")
+
+
 def test_a_map_far_from_all_cameras_is_doubted(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True)
     flight.settings["map"] = {"file": str(real_data("second/isprs_samp11-utm.pcd")), "resolution_m": 2.0}

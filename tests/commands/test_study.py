@@ -232,6 +232,7 @@ def test_an_interrupted_study_of_a_session_goes_on_and_ranks_what_is_known(
         assert [float(row["capped_mm"]) for row in csv.DictReader(file)] == list(error.values())
     again = run(*grid)
     assert "unchanged" in again.output
+    assert again.output.splitlines()[-1].startswith("next: mocap ")
     assert "trade-off" in again.output
     assert max(map(len, again.output.split("\nbest is")[0].splitlines())) <= 100
 

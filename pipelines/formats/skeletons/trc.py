@@ -31,6 +31,10 @@ from pipelines.session.storage import bad_value, damaged, empty, read_text
 
 # Seven decimals of a metre are below any measurement error, and rows stay readable.
 _DECIMALS = 7
+# Programs write the heading of the column of numbers in these ways.
+_FRAME = re.compile(r"\s*frame\s*#", re.IGNORECASE)
+# Fields of fixed length end with zero bytes, and tables save quotes.
+_PADDING = " \t\r\"'\0"
 # So many frames are text at a time, which bounds the memory.
 _FRAMES_AT_ONCE = 1000
 
@@ -49,14 +53,14 @@ def _read(path: Path, unit: str | None, axes: str | None) -> JointMotion:
     if not readable.all() or (np.diff(t_ns) <= 0).any():
         bad = np.flatnonzero(~readable | (np.diff(t_ns, prepend=t_ns[0] - 1) <= 0))
         raise damaged(path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase")
-    position = to_metres_z_up(path, values, unit or metric_unit(header.keys.get("Units", "")), axes or "y-up")
+    position = to_metres_z_up(path, values, unit or metric_unit(header.keys.get("units", "")), axes or "y-up")
     return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
 
 
 def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
     """Return the header, the lines below it, and the line number of the first of those in the file."""
     lines = text.split("\n")
-    if len(lines) < 5 or not lines[0].startswith("PathFileType") or not re.match(r"Frame\s*#", lines[3]):
+    if len(lines) < 5 or not lines[0].startswith("PathFileType") or not re.match(_FRAME, lines[3]):
         problem = "has no TRC header (five lines from PathFileType to X1 Y1 Z1)"
         raise DataError(path, problem, "export it again", code="missing-column")
     markers = tuple(cell.strip() for cell in lines[3].split("\t")[2:] if cell.strip())
@@ -68,7 +72,11 @@ def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
         problem = f"names the marker {twice[0]} more than once"
         raise DataError(path, problem, "rename one", code="stated-twice")
     keys = zip(lines[1].split("\t"), lines[2].split("\t"), strict=False)
-    return _TrcHeader({key.strip(): value.strip() for key, value in keys}, markers), lines[5:], 6
+    return (
+        _TrcHeader({key.strip().lower(): value.strip(_PADDING) for key, value in keys}, markers),
+        lines[5:],
+        6,
+    )
 
 
 def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tuple[list[str], Float]:

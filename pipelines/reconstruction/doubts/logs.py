@@ -24,6 +24,10 @@ _UNITS_M = {"cm": 0.01, "mm": 0.001}
 _SAME_PATH_M = 0.1
 # Two drones cannot start at places that are nearer to each other than this.
 _SAME_START_M = 0.5
+# Cameras of one rig are farther apart than this, as in the narrowest stereo cameras.
+_LEAST_BASELINE_M = 0.05
+# Cameras that film one person together are about so far apart, which tells cm from mm.
+_USUALLY_APART_M = 10.0
 # Cameras that are together and look alike to this angle are on one drone.
 _ONE_BODY_DEG = 45.0
 
@@ -35,24 +39,38 @@ def doubts_of_logs(cameras: Mapping[str, tuple[CameraEntry, Trajectory]]) -> lis
     return [doubt for doubt in found if doubt is not None]
 
 
+def doubt_of_unit(cameras: Mapping[str, Trajectory], units: Mapping[str, str | None]) -> Doubt | None:
+    """Find a unit, stated (None: not) or not, in which all cameras stand on one spot or too far apart."""
+    middle = [np.median(track.position, axis=0) for track in cameras.values()]
+    all_apart = [float(np.linalg.norm(one - other)) for one, other in combinations(middle, 2)]
+    if not all_apart:
+        return None
+    still = [len(track.t_ns) == 1 for track in cameras.values()]
+    stated, widest_m = next(iter(units.values())), max(all_apart)
+    nearest_m = _LEAST_BASELINE_M if any(still) else _SAME_START_M
+    unit = None
+    if stated in _UNITS_M and set(units.values()) == {stated}:
+        unit = "m" if widest_m < nearest_m and widest_m / _UNITS_M[stated] < _TEAM_M else None
+    # Of two drones, one alone may be in another unit or place; still cameras come from one calibration.
+    tells = (len(middle) > 2 or all(still)) and min(all_apart) > _ONE_FLIGHT_M
+    if tells or (widest_m > _TEAM_M and all(map(_is_too_fast, cameras.values()))):
+        usual = min(_UNITS_M, key=lambda unit: abs(np.log(widest_m * _UNITS_M[unit] / _USUALLY_APART_M)))
+        unit = usual if widest_m * _UNITS_M[usual] < _TEAM_M else None
+    if unit is None:
+        return None
+    return Doubt(
+        code="unit",
+        cameras=list(cameras),
+        what=f"all cameras are {_length(widest_m)} apart: their positions are in {unit}",
+        evidence={"apart_m": round(widest_m, 4)},
+        remedy="; ".join(f"cameras.{name}.pose.unit: {unit}" for name in cameras),
+    )
+
+
 def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Float] | None) -> list[Doubt]:
     """Find cameras, and a map (by its corners), that lie too far from the others to be of one flight."""
     middle = {name: np.median(track.position, axis=0) for name, track in cameras.items()}
     doubts = []
-    all_far = [_apart_m(*two) for two in combinations(middle.values(), 2)]
-    # Of two drones, one alone may be in another unit or place; still cameras come from one calibration.
-    tells = len(middle) > 2 or all(len(track.t_ns) == 1 for track in cameras.values())
-    if tells and all_far and _ONE_FLIGHT_M < min(all_far) <= max(all_far) < _TEAM_M / _UNITS_M["mm"]:
-        doubts.append(
-            Doubt(
-                code="unit",
-                cameras=list(middle),
-                what="all cameras are kilometres apart: their positions are in mm",
-                evidence={"apart_m": round(min(all_far), 1)},
-                remedy="; ".join(f"cameras.{name}.pose.unit: mm" for name in middle),
-            )
-        )
-        middle = {}
     for name, place in middle.items():
         others = [other for key, other in middle.items() if key != name]
         if not others or min(_apart_m(place, other) for other in others) < _ONE_FLIGHT_M:
@@ -71,7 +89,7 @@ def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Fl
                 remedy=f"cameras.{name}.pose.{remedy}",
             )
         )
-    if map_box is not None and middle:
+    if map_box is not None:
         low, high = map_box
         away_m = min(_apart_m(place, np.clip(place, low, high)) for place in middle.values())
         if away_m > _ONE_FLIGHT_M:
@@ -93,13 +111,20 @@ def _apart_m(one: Float, other: Float) -> float:
 
 def _unit(place: Float, track: Trajectory, others: list[Float]) -> str | None:
     """Return the unit in which a place would lie beside others, if the drone flew too fast for metres."""
-    passed_s = float(track.t_ns[-1] - track.t_ns[0]) / 1e9
-    flown_m = float(np.linalg.norm(np.diff(track.position, axis=0), axis=1).sum())
-    if passed_s <= 0 or flown_m / passed_s < _TOO_FAST_MPS:
+    if not _is_too_fast(track):
         return None
     apart_m = {unit: min(_apart_m(place * m, other) for other in others) for unit, m in _UNITS_M.items()}
     nearest = min(apart_m, key=lambda unit: apart_m[unit])
     return nearest if apart_m[nearest] < _ONE_FLIGHT_M / 10 else None
+
+
+def _is_too_fast(track: Trajectory) -> bool:
+    flown_m = float(np.linalg.norm(np.diff(track.position, axis=0), axis=1).sum())
+    return flown_m / _TOO_FAST_MPS > float(track.t_ns[-1] - track.t_ns[0]) / 1e9
+
+
+def _length(length_m: float) -> str:
+    return f"{100 * length_m:.2g} cm" if length_m < 1 else f"{length_m / 1000:.2g} km"
 
 
 def _elsewhere(place: Float) -> str:

@@ -125,6 +125,7 @@ def opensim() -> Any:
 def test_spellings_of_other_programs(tmp_path: Path) -> None:
     rows = "1\t0.0\t1.5\t2\t3\t4\t5\t6\n2\t0.1\t1.5\t2\t3\t\t\t\n"
     expected = read(write(tmp_path, HEADER + rows)).position
-    commas = HEADER.replace("Frame#", "Frame #") + rows.replace(".", ",").replace("\t\t\t\n", "\n")
+    padded = HEADER.replace("Frame#", " frame #").replace("Units", " units").replace("\tmm", "\t Mm\0 ")
+    commas = padded + rows.replace(".", ",").replace("\t\t\t\n", "\n")
     np.testing.assert_array_equal(read(write(tmp_path, commas)).position, expected)
     assert np.isnan(expected[1, 0, 1]).all()
