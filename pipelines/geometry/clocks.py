@@ -228,6 +228,8 @@ def find_receipt_steps(header_ns: Int64, received_ns: Int64) -> list[tuple[int, 
     Delays scatter, so that the medians of many messages before and after tell. A queue that is emptied is no
     step: its messages arrive at once.
     """
+    import pandas as pd
+
     delay_s = (received_ns - header_ns - (received_ns[0] - header_ns[0])) / 1e9
     interval_s = np.diff(header_ns) / 1e9
     usual_s = max(float(np.median(interval_s)), 1e-6)
@@ -235,7 +237,7 @@ def find_receipt_steps(header_ns: Int64, received_ns: Int64) -> list[tuple[int, 
     found: list[tuple[int, float]] = []
     if len(delay_s) < 2 * window or np.quantile(np.abs(interval_s - usual_s), _SEPARATED_SHARE) > usual_s / 4:
         return found
-    level_s = np.median(np.lib.stride_tricks.sliding_window_view(delay_s, window), axis=1)
+    level_s = pd.Series(delay_s).rolling(window).median().to_numpy()[window - 1 :]
     change_s = level_s[window:] - level_s[:-window]
     # Delays behind each other in a queue correlate, which the usual change shows.
     least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(np.abs(change_s))))

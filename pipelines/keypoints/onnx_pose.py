@@ -104,14 +104,15 @@ def parse_options(argument: str) -> OnnxOptions:
     """Parse the text after the colon; a path may hold commas. DataError: an unknown or bad option."""
     parts = argument.split(",")
     first = next((i for i, part in enumerate(parts) if i and re.match(r"[a-z_]+=", part)), len(parts))
-    given: dict[str, str] = {}
+    given = {"model": ",".join(parts[:first]), "stated": ""}
+    unstated = (*given, "people", "provider")
     for part in parts[first:]:
         name, _, value = part.partition("=")
         if name in given:
             raise DataError(f"onnx:{argument}", f"states {name} twice", "state it once", code="stated-twice")
         given[name] = value
-    stated = tuple(sorted((name, given[name]) for name in given if name not in ("people", "provider")))
-    values: dict[str, object] = {**given, "model": ",".join(parts[:first]), "stated": stated}
+    values: dict[str, object] = {**given}
+    values["stated"] = tuple(sorted((name, given[name]) for name in given if name not in unstated))
     values |= {name: Path(str(values[name])).expanduser() for name in ("model", "people") if name in values}
     return checked(OnnxOptions, values, f"onnx:{argument}", OPTION_CODES)
 

@@ -554,7 +554,8 @@ class _Stretch:
         )
         free = self._solved(prior)
         if again is not None and (free is None or np.median(free.missed) > _WORST_PX):
-            free = again._solved(prior, stiff=True) or free
+            both = [each for each in (free, again._solved(prior, stiff=True)) if each is not None]
+            free = min(both, key=_misfit, default=None)
         if stands is None or (free is not None and _misfit(stands) > _misfit(free) + _STANDS):
             return free
         return stands

@@ -656,7 +656,7 @@ def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
         residual = seen - design @ errors
         square = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(spread), residual)
         pair = matches.pair[matches.patch]
-        factor = np.ones(int(matches.pair.max(initial=-1)) + 1)
+        factor = np.ones(len(pairs))
         for number in np.unique(pair).tolist():
             factor[number] = max(1.0, float(np.median(square[pair == number])) / _MEDIAN_OF_TWO)
         scale = (1 / factor)[matches.pair]
@@ -666,8 +666,9 @@ def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
         mixed = _sums(np.swapaxes(design, 1, 2) @ cut * weight[:, None, None], matches.patch, len(count))
         pull = _sums(np.einsum("kji,kj->ki", cut, seen) * weight[:, None], matches.patch, len(count))
         back = mixed @ np.linalg.inv(by_place + np.linalg.inv(matches.covariance) * scale[:, None, None])
-        normal = np.einsum("kji,k,kjl->il", design, weight, design) - np.einsum("pij,pkj->ik", back, mixed)
-        right = np.einsum("kji,k,kj->i", design, weight, seen) - np.einsum("pij,pj->i", back, pull)
+        weighed = design * weight[:, None, None]
+        normal = np.tensordot(weighed, design, ([0, 1], [0, 1])) - np.tensordot(back, mixed, ([0, 2], [0, 2]))
+        right = np.tensordot(weighed, seen, ([0, 1], [0, 1])) - np.tensordot(back, pull, ([0, 2], [0, 1]))
         covariance = np.linalg.inv(normal + np.diag(every**-2.0))
         errors = covariance @ right
     residual = seen - design @ errors

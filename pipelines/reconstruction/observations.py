@@ -36,16 +36,14 @@ class ErrorModes:
     The sizes have a standard deviation of 1. The whole path may have a constant shift besides.
     """
 
-    t_ns: Int64  # [S]
+    t_ns: Int64  # [S], two or more
     response: Float  # [S, 6, R] of position in the world (m) and rotation vector in the camera (rad)
     shift_m: float  # standard deviation of the constant shift
 
     def at(self, t_ns: Int64) -> Float:
-        """Interpolate the response [..., 6, R]."""
-        after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, max(len(self.t_ns) - 1, 1))
+        """Interpolate the response [..., 6, R]; it stays beyond the ends."""
+        after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, len(self.t_ns) - 1)
         before = self.t_ns[after - 1]
-        if len(self.t_ns) == 1:
-            return np.broadcast_to(self.response[0], (*t_ns.shape, *self.response.shape[1:]))
         share = np.clip((t_ns - before) / (self.t_ns[after] - before), 0.0, 1.0)[..., None, None]
         return np.asarray((1 - share) * self.response[after - 1] + share * self.response[after])
 
