@@ -174,7 +174,7 @@ def _files(folder: Path) -> list[tuple[str, Path]]:
 
 def files_in(path: Path) -> list[Path]:
     """Return the files of a folder, without those below, or of a pattern of names (`images/left_*.png`)."""
-    folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
+    folder, pattern = (path, "*") if path.is_dir() else (path.parent, re.sub(r"\*+", "*", path.name))
     return [file for file in folder.glob(pattern) if file.is_file()] if "*" in pattern else []
 
 

@@ -250,7 +250,7 @@ class FlightCameras:
 def _numbers_as_taken(pts_ns: Int64) -> Int64:
     """Number pictures [N] as they were taken, from 0, lost ones among them; by even stamps alone."""
     steps_ns = np.diff(pts_ns)
-    usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 1.0
+    usual_ns = max(float(np.median(steps_ns)), 1.0) if len(steps_ns) else 1.0
     counts = np.rint(steps_ns / usual_ns).astype(np.int64)
     if (counts < 1).any() or (np.abs(steps_ns - counts * usual_ns) > _EVEN * usual_ns).any():
         return np.arange(len(pts_ns))

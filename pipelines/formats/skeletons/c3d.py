@@ -47,6 +47,8 @@ _LONGEST_TEXT = 255
 _MOST_RESIDUAL = 255
 # Header and POINT:FRAMES count no further.
 _MOST_COUNTED = 65_535
+# Frames farther apart than a quarter of an hour are no motion.
+_LEAST_RATE_HZ = 0.001
 # C3D has no parameters of more dimensions.
 _MOST_DIMENSIONS = 7
 # Dimensions of a parameter are stored in one byte.
@@ -201,7 +203,7 @@ def _number(
 
 
 def _words(values: Sequence[Any]) -> int | None:
-    if not values:
+    if not values or not all(isinstance(v, int | float) and math.isfinite(v) for v in values[:2]):
         return None
     low, high = (int(v) & 0xFFFF for v in [*values, 0][:2])
     return low | high << 16
@@ -242,7 +244,7 @@ def _times(path: Path, contents: _Contents, frames: int) -> Int64:
         step_ns = span / max(frames - 1, 1)
         since: Int64 = np.rint(np.arange(frames) * step_ns).astype(np.int64)
         return np.asarray(start + since, np.int64)
-    if not rate or not 0 < rate < 1e6:
+    if not rate or not _LEAST_RATE_HZ < rate < 1e6:
         raise damaged(path, f"states a rate of {rate} Hz")
     number = max(contents.first_frame - 1, 0)
     times: Int64 = np.rint((number + np.arange(frames)) * (1e9 / rate)).astype(np.int64)

@@ -345,6 +345,12 @@ def _read_long(path: Path, text: str, unit: str | None, axes: str) -> JointMotio
         table = pd.read_csv(StringIO(text), dtype=str, keep_default_na=False)
     except ValueError as error:
         raise damaged(path, error) from error
+    headings = [cell_name(cell) for cell in table.columns]
+    table.columns = pd.Index([name for name, _ in headings])
+    if not table.columns.is_unique:
+        raise DataError(path, "names a column more than once", "rename one", code="stated-twice")
+    units = dict(headings)
+    unit = unit or metric_unit(units.get("x_coord") or units.get("x") or "")
     if _columns(text) >= _CALISCOPE:
         table["keypoint"] = table["point_id"].map(_points_of_caliscope(path))
         table = table[table["keypoint"].notna()]

@@ -155,6 +155,8 @@ def test_numbered_points_of_caliscope(tmp_path: Path, tracker: str, numbered: di
     assert (motion.joints, motion.timed) == (tuple(filter(None, numbered.values())), False)
     assert motion.t_ns.tolist() == [3 * 10**9, 4 * 10**9]
     assert motion.position[1, 0, 0].tolist() == [min(numbered), 4, 2]
+    path.write_text(path.read_text().replace("sync", " Sync").replace("coord", "coord (mm)"))
+    np.testing.assert_allclose(read(path).position, motion.position / 1000)
     unknown = path.rename(tmp_path / "xyz_CHARUCO.csv")
     with refused("no-such-name", unknown, "xyz_CHARUCO_labelled.csv"):
         read(unknown)

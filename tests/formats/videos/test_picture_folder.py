@@ -172,3 +172,4 @@ def test_several_cameras_of_airsim_in_one_folder(tmp_path: Path) -> None:
     for path in (tmp_path / "images").glob("img_Drone2*"):
         path.unlink()
     assert READER.index(tmp_path / "images").count == 5
+    assert READER.index(tmp_path / "images" / "**Drone1*").count == 5
