@@ -52,7 +52,8 @@ def doubt_of_unit(cameras: Mapping[str, Trajectory], units: Mapping[str, str | N
     if stated in _UNITS_M and set(units.values()) == {stated}:
         unit = "m" if widest_m < nearest_m and widest_m / _UNITS_M[stated] < _TEAM_M else None
     # Of two drones, one alone may be in another unit or place; still cameras come from one calibration.
-    tells = (len(middle) > 2 or all(still)) and min(all_apart) > _ONE_FLIGHT_M
+    far_m = _TEAM_M if all(still) else _ONE_FLIGHT_M
+    tells = (len(middle) > 2 or all(still)) and min(all_apart) > far_m
     if tells or (widest_m > _TEAM_M and all(map(_is_too_fast, cameras.values()))):
         usual = min(_UNITS_M, key=lambda unit: abs(np.log(widest_m * _UNITS_M[unit] / _USUALLY_APART_M)))
         unit = usual if widest_m * _UNITS_M[usual] < _TEAM_M else None
