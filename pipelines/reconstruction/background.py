@@ -1088,7 +1088,7 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:
         return camera
     posed = np.isfinite(found.position[:, 0])
     trajectory = Trajectory(t_ns[posed], found.position[posed], quaternion_from_matrix(found.rotation[posed]))
-    covariance = found.covariance[posed]
+    covariance, every = found.covariance[posed], -(-int(posed.sum()) // STRETCH)
     variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
     return replace(
         camera,
@@ -1096,7 +1096,7 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:
         sigma=np.sqrt(variances.mean(axis=2)),
         covariance=covariance,
         errors=found.left,
-        modes=ErrorModes(t_ns[posed], found.modes[posed], found.shift_m),
+        modes=ErrorModes(t_ns[posed][::every], found.modes[posed][::every], found.shift_m),
         loosened=_loosened_still(camera.loosened_at(t_ns[posed]), variances.mean(axis=2)),
     )
 

@@ -85,6 +85,8 @@ _LEVELS = 3
 _SIGMAS = 3.0
 # More sightings of a cloud are thinned out, which bounds its memory.
 _MOST_SIGHTINGS = 500_000
+# Derivatives of so many sightings at a time take some 20 MB.
+_AT_ONCE = 20_000
 # This is the median of the chi-square distribution with two degrees of freedom.
 _MEDIAN_OF_TWO = 2 * np.log(2)
 # Of the chi-square distribution with two degrees of freedom, 99 % are below this.
@@ -314,8 +316,11 @@ def _cloud(
     covariance = np.linalg.inv(
         _sums(across * weight[:, None, None], number, points) + _ANYWHERE_M**-2.0 * np.eye(3)
     )
-    moved = across @ _moved(camera, when, arm, rotation) * weight[:, None, None]
-    by_error = covariance @ _sums(moved, number, points)
+    by_error = np.zeros((points, 3, 1))
+    for part in np.array_split(np.arange(len(ray)), -(-len(ray) // _AT_ONCE)):
+        moved = across[part] @ _moved(camera, when[part], arm[part], rotation[part])
+        by_error = by_error + _sums(moved * weight[part, None, None], number[part], points)
+    by_error = covariance @ by_error
     far, off = (np.bincount(number, each, points) / np.maximum(count, 1) for each in (distance, missed))
     kept = (count >= _FEWEST_SIGHTINGS) & (np.trace(covariance, axis1=1, axis2=2) < _POINT_SIGMA_M**2)
     kept &= (off < _WORST_PX) & (far > _NEAREST_M) & (far < _FARTHEST_M)
