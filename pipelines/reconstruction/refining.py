@@ -303,8 +303,13 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
         return replace(refined, clock_sigma_s=settled.clock_sigma_s), offset_s
     for _ in range(1 + _MOST_SHIFTS):
         refined = _refine_with_offsets(flight, offset_s, started)
-        offset_s = offset_s + refined.clock_offset_s
-        if not _unsettled(refined).any():
+        # Its prior is about the shifted stamps; the stated one draws back what pictures do not determine.
+        kept = np.square(
+            refined.clock_sigma_s / np.where(flight.clock_sigma_s > 0, flight.clock_sigma_s, np.inf)
+        )
+        moved_s = refined.clock_offset_s - kept * offset_s
+        offset_s = offset_s + moved_s
+        if (np.abs(moved_s) <= np.maximum(SETTLED_S, refined.clock_sigma_s)).all():
             break
         started = _start_with_offsets(flight, offset_s)
     return refined, offset_s
