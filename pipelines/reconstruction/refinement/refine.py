@@ -23,7 +23,7 @@ from pipelines.reconstruction.refinement.elimination import (
     eliminate,
     shared_covariance,
 )
-from pipelines.reconstruction.refinement.estimate import BOUND, BOUNDS, initial_state, learn, solve
+from pipelines.reconstruction.refinement.estimate import BOUND, initial_state, learn, solve
 from pipelines.reconstruction.refinement.kernels import State, turned
 from pipelines.reconstruction.refinement.system import (
     REMEMBERED,
@@ -40,8 +40,8 @@ from pipelines.reconstruction.refinement.system import (
 _WHOLE_TIMES, _WINDOWS, _WINDOW = 400, 3, 100
 # Learning ends after this many rounds, converged or not.
 _LEARNING_ROUNDS = 8
-# Most estimates converge in eight rounds; robust weights of somebody who stands settle slowly.
-_ROUNDS = 30
+# Estimates converge in fewer rounds.
+_ROUNDS = 12
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
 # Lengths between keypoints vary by this much before they are learned.
 _BONE_SIGMA_M = 0.02
@@ -207,13 +207,12 @@ class _Prior:
 def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails."""
     known, problem = prior.known, views.problem()
-    whole = len(prior.state.position) == len(problem.t_s)
-    state = prior.state if whole else initial_state(problem, known, views.start)
+    # Where levels were learned is farther away for somebody who stands.
+    state = initial_state(problem, known, views.start)
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
-    bounds = (BOUND,) if whole else BOUNDS
-    system, state, at = solve(problem, known, state, rounds=_ROUNDS, bounds=bounds)
+    system, state, at = solve(problem, known, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
