@@ -399,8 +399,9 @@ def test_a_stated_clock_that_is_wrong_is_moved_and_doubted(
         assert moved[name]["by"] == "keypoints"
         assert abs(moved[name]["offset_s"] - seconds) < within_s
         (doubt,) = metrics["doubts"]
-        assert doubt["remedy"].startswith(f"cameras.{name}.clock.offset_s: ")
-        assert abs(float(doubt["remedy"].split()[-1])) < within_s
+        # People do not tell which of two clocks is wrong, so nothing is proposed there.
+        assert doubt["remedy"].startswith(f"cameras.{name}.clock.offset_s: ") == (cameras == 3)
+        assert cameras == 2 or abs(float(doubt["remedy"].split()[-1])) < within_s
     assert all(
         metrics.get("clock_offsets_s", {}).get(name, 0.0) == 0.0 for name in {*flight.cameras} - {*late_s}
     )

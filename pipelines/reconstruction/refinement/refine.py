@@ -207,9 +207,10 @@ class _Prior:
 def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails."""
     known, problem = prior.known, views.problem()
-    # Where levels were learned is farther away for somebody who stands.
+    # Where levels were learned is farther from the minimum than the start for somebody who stands.
     state = initial_state(problem, known, views.start)
-    clock_s, clock_left_s = _clocks(problem, known, state)
+    whole = len(prior.state.position) == len(problem.t_s)
+    clock_s, clock_left_s = _clocks(problem, known, prior.state if whole else state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
     system, state, at = solve(problem, known, state, rounds=_ROUNDS)
