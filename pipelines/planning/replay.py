@@ -490,6 +490,7 @@ class Detect(Protocol):
         skeleton: Float,
         focal_px: float,
         rng: np.random.Generator,
+        /,
     ) -> tuple[Float, Float]:
         """Return keypoints [T, J, 2] px (NaN: missed) and confidences [T, J] of exact pixels.
 
