@@ -765,10 +765,10 @@ class _Stretch:
         return np.asarray(own + border @ factored.corner @ np.swapaxes(border, 1, 2))
 
     def _modes(self, factored: _Factored) -> Float:
-        """Compute the response [T, 6, R] of each picture's error to what its polynomials of time may be.
+        """Compute the response [T, 6, R] of the errors to independent standard normal numbers (`ErrorModes`).
 
-        The mean comes first. Sizes are those of independent standard normal numbers: the response is the
-        covariance with the polynomials times the root of the inverse of theirs.
+        The numbers determine coefficients of polynomials of time, the mean over the stretch first. If L L' is
+        their covariance and C [T, 6, R] that of errors and coefficients, the response is C L'^-1.
         """
         from scipy.linalg.lapack import dpbtrs
 

@@ -329,7 +329,7 @@ def _cloud(
 
 
 def _moved(camera: Camera, t_ns: Int64, arm: Float, rotation: Float) -> Float:
-    """Compute how points at `arm` [K, 3] from a camera move with it, by its unknowns [K, 3, U]."""
+    """Compute derivatives [K, 3, U] of points by a camera's unknowns; `arm` [K, 3] m leads to them."""
     turned = -cross_matrix(arm) @ rotation
     moved = [np.broadcast_to(np.eye(3), turned.shape), turned]
     if camera.modes is not None:
@@ -595,7 +595,7 @@ def _vertex(before: float, top: float, after: float) -> float:
 
 
 def _unknowns(cameras: Sequence[Camera]) -> list[slice]:
-    """List where the unknowns of each camera stand."""
+    """List the places of each camera's unknowns among those of all cameras."""
     ends = np.cumsum([_MODES + (0 if c.modes is None else c.modes.response.shape[2]) for c in cameras])
     return [slice(begin, end) for begin, end in pairwise([0, *ends.tolist()])]
 

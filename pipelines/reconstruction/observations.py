@@ -31,9 +31,10 @@ _USUAL = 1.5
 
 @dataclass(frozen=True)
 class ErrorModes:
-    """What is not known of a path after all: its error is a sum of modes with independent sizes.
+    """Remaining pose errors of a camera whose poses were refined by its background.
 
-    The sizes have a standard deviation of 1. The whole path may have a constant shift besides.
+    The error at time t is the response at t times R unknown numbers. These are independent, with mean 0 and
+    standard deviation 1. A constant shift of the whole path is added.
     """
 
     t_ns: Int64  # [S], two or more
@@ -41,7 +42,7 @@ class ErrorModes:
     shift_m: float  # standard deviation of the constant shift
 
     def at(self, t_ns: Int64) -> Float:
-        """Interpolate the response [..., 6, R]; it stays beyond the ends."""
+        """Interpolate the response [..., 6, R] at times [...] ns; beyond the ends, the nearest."""
         after = np.clip(np.searchsorted(self.t_ns, t_ns), 1, len(self.t_ns) - 1)
         before = self.t_ns[after - 1]
         share = np.clip((t_ns - before) / (self.t_ns[after] - before), 0.0, 1.0)[..., None, None]

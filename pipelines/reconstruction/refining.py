@@ -303,7 +303,8 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
         return replace(refined, clock_sigma_s=settled.clock_sigma_s), offset_s
     for _ in range(1 + _MOST_SHIFTS):
         refined = _refine_with_offsets(flight, offset_s, started)
-        # Its prior is about the shifted stamps; the stated one draws back what pictures do not determine.
+        # This estimate had a prior with mean 0 at the shifted stamps. The stated one has mean 0 at the given
+        # stamps, so it draws offsets back, the more the less pictures determine them.
         kept = np.square(
             refined.clock_sigma_s / np.where(flight.clock_sigma_s > 0, flight.clock_sigma_s, np.inf)
         )

@@ -52,7 +52,7 @@ Medians of the same pictures: BlazePose is best from the front, and worst from t
 """
 
 LASTING_SHARE = 0.5
-"""Share of the variance of a joint's error that lasts while it is seen from one side, in those pictures."""
+"""Share of the variance of a joint's error in those pictures that stays the same over a flight."""
 
 OUTLIER_SHARES = (0.2, 1.0)
 """Distance of an outlier from the truth, in heights of the person: least and most."""

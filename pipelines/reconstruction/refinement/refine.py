@@ -207,7 +207,7 @@ class _Prior:
 def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails."""
     known, problem = prior.known, views.problem()
-    # Where levels were learned is farther from the minimum than the start for somebody who stands.
+    # If somebody stands, the state from which levels were learned is far from the minimum.
     state = initial_state(problem, known, views.start)
     whole = len(prior.state.position) == len(problem.t_s)
     clock_s, clock_left_s = _clocks(problem, known, prior.state if whole else state)
