@@ -26,6 +26,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
+from pipelines import api
 from pipelines.planning.config import Imperfections, PlannerConfig
 from pipelines.session import camera_poses, registries, tables
 from pipelines.session.description import DOUBT_CODES
@@ -312,6 +313,17 @@ def _cells(name: str, words: int) -> dict[str, dict[str, str]]:
     return {" ".join(row[:words]): dict(zip(header, row, strict=True)) for row in rows}
 
 
+def functions() -> str:
+    """List the public functions with the first sentences of their docstrings."""
+    there = {name: getattr(api, name) for name in dir(api)}
+    rows = [
+        (f"`{name}`", sentence(" ".join((inspect.getdoc(each) or "").split("\n\n")[0].split())))
+        for name, each in there.items()
+        if inspect.isfunction(each)
+    ]
+    return table(("function", "does"), rows)
+
+
 def planner() -> str:
     """List the settings of the planner."""
     rows = []
@@ -335,6 +347,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "tables": columns,
     "codes": codes,
     "planner": planner,
+    "functions": functions,
 }
 
 

@@ -1,7 +1,9 @@
 """The public functions of mocap for notebooks and programs: every stage of a flight, and its tables.
 
-Each takes paths and settings, and raises `DataError` with one line where its input cannot be used. Only
-what this module names is promised between versions; the rest of `pipelines` is the inside.
+Each takes paths and settings, and raises `DataError` with one line where its input cannot be used. A
+`progress` is told what is done (nobody by default), `force` makes anew what is finished, and `workers` are
+processes: results do not depend on them. Only what this module names is promised between versions; the rest
+of `pipelines` is the inside.
 """
 
 from collections.abc import Sequence
@@ -10,7 +12,6 @@ from pathlib import Path
 import pandas as pd
 import pyarrow as pa
 
-from pipelines.batch import batch
 from pipelines.check import check
 from pipelines.draft import draft
 from pipelines.export import export
@@ -25,14 +26,12 @@ from pipelines.session.manifest import read_flight
 from pipelines.session.stages import open_session
 from pipelines.session.tables import ANGLES, SKELETON, read_table
 from pipelines.simulate import simulate
-from pipelines.study import study
 
 __all__ = [
     "DataError",
     "ReconstructSettings",
     "ReplanSettings",
     "angles",
-    "batch",
     "check",
     "draft",
     "export",
@@ -44,7 +43,6 @@ __all__ = [
     "run",
     "simulate",
     "skeleton",
-    "study",
 ]
 
 

@@ -91,7 +91,7 @@ from pipelines.sources.world import losses
 
 INGEST = Stage("ingest", revision=16)
 
-_OF_ONE_CAMERA = (
+OF_ONE_CAMERA = (
     "one camera gives a rough estimate: how far away people are is told by their stature alone; a second"
     " drone across would measure it (mocap reconstruct says how many mm it would gain)"
 )
@@ -176,7 +176,7 @@ def ingest(
             warnings += reader.take_notes()
             warnings += assumptions_as_warnings(flight.assumptions)
             if len(entries) == 1:
-                warnings.append(_OF_ONE_CAMERA)
+                warnings.append(OF_ONE_CAMERA)
 
             tables = {name: run.folder / "cameras" / name / "poses.parquet" for name in entries}
             tracks = {name: trajectory_from(read_table(path, POSES)) for name, path in tables.items()}

@@ -146,21 +146,29 @@ _LONGEST_FILL_S = 10.0
 
 @dataclass(frozen=True)
 class ReconstructSettings:
-    """Settings that determine the result, in addition to the session itself."""
+    """Settings that determine the result, in addition to the session itself.
+
+    `rate_hz` is that of the skeleton (None: pictures of the camera with the most). `people` of None is `auto`
+    if several were logged by name, else 1. Keypoints below `min_confidence` are not used. `pose_noise`
+    replaces that of flight.yaml. The `detector` looks at cameras with pictures and without keypoints: at one
+    picture in `every`, from `start_s` to `end_s` after the flight's first. `fill_s` is the longest gap that
+    is filled, `smooth` a filter ("butterworth:cutoff_hz=6"). `refine_cameras` corrects poses by backgrounds
+    before other methods than `auto`. `disturb_poses` adds errors ("white:position_m=0.3 x20 seed=3").
+    """
 
     method: Method | Literal["refined", "auto"] = "auto"
     rate_hz: float | None = None
-    people: int | Literal["auto"] | None = None  # None: `auto` if several were logged by name, else 1
+    people: int | Literal["auto"] | None = None
     min_confidence: float = 0.3
     pose_noise: str | None = None
-    detector: str = "blazepose"  # for cameras with pictures and without keypoints
-    every: int = 1  # of their pictures
-    start_s: float | None = None  # since the flight's first picture: span of pictures for the detector
+    detector: str = "blazepose"
+    every: int = 1
+    start_s: float | None = None
     end_s: float | None = None
-    fill_s: float | None = None  # the longest gap that is filled
-    smooth: str | None = None  # as `finishing.smoother` reads it
-    refine_cameras: Literal["background"] | None = None  # before the triangulation; `auto` does it unasked
-    disturb_poses: str | None = None  # errors added to the logged poses, as `PoseDisturbance.parse` reads it
+    fill_s: float | None = None
+    smooth: str | None = None
+    refine_cameras: Literal["background"] | None = None
+    disturb_poses: str | None = None
 
     @property
     def asks_background(self) -> bool:

@@ -6,7 +6,7 @@ from pathlib import Path
 from pipelines.draft import draft, leave_out, must_be_drafted
 from pipelines.drafting.manifest_text import one_line
 from pipelines.drafting.matching import Answer, Ask, Question, leave_open
-from pipelines.ingest import Ingested, ingest
+from pipelines.ingest import OF_ONE_CAMERA, Ingested, ingest
 from pipelines.reconstruct import Reconstructed, reconstruct
 from pipelines.replan import replan
 from pipelines.report import report
@@ -47,6 +47,7 @@ def run(folder: Path, *, ask: Ask = leave_open, workers: int = 1, progress: Prog
             progress.note(f"planners were not compared: {error}")
     page = report(session).place
     warnings = dict.fromkeys([*left_out, *description.warnings, *reconstructed.record.warnings])
+    warnings.pop(OF_ONE_CAMERA, None)  # the verdict says it, with numbers
     return Ran(manifest, description.assumptions, session, reconstructed, page, list(warnings))
 
 

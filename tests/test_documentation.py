@@ -225,7 +225,11 @@ def test_every_example_of_a_manifest_or_scenario_is_valid() -> None:
 
 
 def test_the_lines_for_python_run_and_the_page_names_all_figures(tmp_path: Path) -> None:
-    (code,) = (block for language, block in _FENCED.findall(_text("session.md")) if language == "python")
+    cells = json.loads((_ROOT / "examples" / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]
+    parts = [block for language, block in _FENCED.findall(_text("api.md")) if language == "python"]
+    parts += ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    code = "\n".join(parts)
+    assert set(re.findall(r"pipelines[.\w]*", code)) == {"pipelines.api"}
     write_flight(tmp_path, seconds=0.5)
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],

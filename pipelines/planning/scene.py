@@ -590,7 +590,7 @@ def build_scene(
     )
     drones = settings.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
     if settings.drones is None and drones != len(flight.cameras):
-        notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
+        notes.append(f"{drones} drones are replayed; cameras of the session: {len(flight.cameras)}")
     if settings.yaw_deg is not None:
         yaw_rad = float(np.radians(settings.yaw_deg))
     else:

@@ -66,6 +66,10 @@ PALETTE = {
 
 # CSS scales a figure as wide as the page to the window; the fonts are chosen for this width.
 WIDTH_IN = 9.0
+# A phone is as wide as this many inches of letters that can be read.
+NARROW_IN = 4.2
+# Letters of the page's fonts are about as wide, with the key before a name.
+LETTER_IN, KEY_IN = 0.055, 0.45
 # A path of more points shows no more on a page 9 inches wide.
 MOST_POINTS = 600
 # A time axis shows no more stretches on a page 9 inches wide.
@@ -261,12 +265,17 @@ class Figure:
     @cached_property
     def drawing(self) -> Drawing:
         """Drawing by matplotlib."""
-        return _draw(self)
+        return _draw(self, WIDTH_IN)
 
     @cached_property
     def svg(self) -> str:
         """Figure as an `<svg>` element for the inside of a page."""
-        return _inline_svg(self)
+        return _inline_svg(self, self.drawing, f"figure-{self.key}")
+
+    @cached_property
+    def narrow_svg(self) -> str:
+        """The same for a phone."""
+        return _inline_svg(self, _draw(self, NARROW_IN), f"figure-{self.key}-narrow")
 
 
 # --- numbers and words of the marks ---
@@ -354,12 +363,12 @@ def page_style() -> Iterator[None]:
         yield
 
 
-def _draw(figure: Figure) -> Drawing:
+def _draw(figure: Figure, width_in: float) -> Drawing:
     from matplotlib.figure import Figure as Drawing
 
     rows, across = len(figure.panels), max(len(row) for row in figure.panels)
     with page_style():
-        drawing = Drawing((WIDTH_IN, figure.height_in), layout="constrained")
+        drawing = Drawing((width_in, figure.height_in), layout="constrained")
         grid = drawing.subplots(
             rows,
             across,
@@ -381,7 +390,8 @@ def _draw(figure: Figure) -> Drawing:
             for handle, name in zip(*axes.get_legend_handles_labels(), strict=True):
                 entries.setdefault(name, handle)
         if entries:
-            count = min(len(entries), figure.columns)
+            widest_in = KEY_IN + LETTER_IN * max(map(len, entries))
+            count = min(len(entries), figure.columns, max(1, int(width_in / widest_in)))
             drawing.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=count)
         if figure.label:
             drawing.supylabel(figure.label, fontsize=7.6, color=MUTED)
@@ -494,20 +504,17 @@ def _settled(drawing: Drawing, scale: float = 1.0) -> Iterator[None]:
         drawing.set_size_inches(*size_in)
 
 
-def _inline_svg(figure: Figure) -> str:
+def _inline_svg(figure: Figure, drawing: Drawing, key: str) -> str:
     buffer = io.StringIO()
-    with page_style(), _settled(figure.drawing):
-        figure.drawing.savefig(
-            buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
-        )
-        times = _time_axes(figure.drawing)
-    drawing = buffer.getvalue()
-    view = re.search(r'viewBox="([^"]+)"', drawing)
+    with page_style(), _settled(drawing):
+        drawing.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        times = _time_axes(drawing)
+    written = buffer.getvalue()
+    view = re.search(r'viewBox="([^"]+)"', written)
     if view is None:
         raise ValueError("matplotlib wrote an SVG without a viewBox")
-    body = drawing[drawing.index("</metadata>") + len("</metadata>") :]
+    body = written[written.index("</metadata>") + len("</metadata>") :]
     body = re.sub(r"<defs>\s*<style[^>]*>[^<]*</style>\s*</defs>", "", body, count=1)
-    key = f"figure-{figure.key}"
     # Matplotlib's own ids are hashes of coordinates whose last bits the layout's solver leaves open.
     tags = "".join(re.findall(r"<[^<>]+>", body))
     found = dict.fromkeys(re.findall(r'(?:url\(#|href="#)([^")]+)', tags))
@@ -523,16 +530,17 @@ def _inline_svg(figure: Figure) -> str:
 
 
 def _time_axes(drawing: Drawing) -> str:
-    """Describe the time axes for the viewer: left and right edge in the drawing, times, height."""
+    """Describe the panels over time for the viewer: left and right edge in the drawing, times, height."""
     width, height = 72 * drawing.get_size_inches()  # the unit of matplotlib's SVG is a point
     parts = []
     for axes in drawing.axes:
         if axes.get_xlabel() == TIME_LABEL:
             place, (start, end) = axes.get_position(), axes.get_xlim()
-            column = [each.get_position().y1 for each in drawing.axes if each.get_position().x0 == place.x0]
             edges = (width * place.x0, width * place.x1, start, end)
-            rows = (height * (1 - max(column)), height * (1 - place.y0))
-            parts.append(" ".join(f"{value:.4f}" for value in (*edges, *rows)))
+            for above in (each.get_position() for each in drawing.axes):
+                if above.x0 == place.x0:
+                    rows = (height * (1 - above.y1), height * (1 - above.y0))
+                    parts.append(" ".join(f"{value:.4f}" for value in (*edges, *rows)))
     return f' data-time="{";".join(parts)}"' if parts else ""
 
 

@@ -60,14 +60,14 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
         if summary.counts.get(word)
     ]
     joints: list[Block] = [table_of_joints(summary), Bullets(statuses)] if summary.motion is not None else []
+    errors = tables_of_errors(summary)
     tables: list[Block] = [
-        Fold("Every joint", [*joints, *drawn("joints", "sigmas")]),
+        *([Fold("All measures", errors)] if errors else []),
+        *([Fold("Every joint", [*joints, *drawn("joints", "sigmas")])] if joints else []),
         Fold("What was ingested", [table_of_cameras(content, summary, started), *drawn("timeline")]),
         Fold("How good the data of each camera is", [table_of_quality(content, summary)]),
         Fold("Settings, versions and hashes", _how_made(content, summary)),
     ]
-    if summary.motion is None:
-        del tables[0]
     sections = [
         Section("verdict", "Verdict", [_template("verdict.html.j2", verdict=verdict)]),
         Section("motion", "The motion", shown),
@@ -79,7 +79,6 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
                 _template("glances.html.j2", figures=_key_figures(summary), glances=at_a_glance(summary)),
                 *([_template("overlays.html.j2", overlays=overlays)] if overlays is not None else []),
                 *drawn("time", "residuals", "top", "angles"),
-                *tables_of_errors(summary),
             ],
         ),
         Section("tables", "Tables and methods", tables),
@@ -128,8 +127,24 @@ def _replan_sections(replan: Replan, content: SessionContent, figures: Sequence[
     warnings = items(content.stages.get("replan", {}), "warnings")
     notes = [*(("doubt", str(each)) for each in warnings), *(("note", note) for note in replan.notes)]
     lead = f"{replan.verdict[:1].upper()}{replan.verdict[1:]}"
-    blocks = [replan.setting, *figures, *replan.tables, Bullets(notes)]
+    blocks = [replan.setting, *_beside_the_flight(content), *figures, *replan.tables, Bullets(notes)]
     return [Section("replan", "Planners compared", blocks, lead, tab="Planners")]
+
+
+def _beside_the_flight(content: SessionContent) -> list[str]:
+    """Say why the flown arm has another error than the reconstruction of the flight."""
+    compared = content.replan.metrics if content.replan is not None else {}
+    modelled = number(section(section(compared, "arms"), "flown"), "mpjpe_mm")
+    metrics = content.metrics or {}
+    expected = items(section(metrics, "verdict"), "expected_error_mm")[1:2]
+    error = number({"mpjpe_mm": expected[0] if expected else None} | metrics, "mpjpe_mm")
+    if modelled is None or error is None:
+        return []
+    return [
+        "Compare errors of arms with each other alone: they are of triangulation, with errors of poses drawn"
+        f" anew. The flown arm has {wording.fixed(modelled, 0)} mm by them; this flight, with its poses"
+        f" corrected, has {wording.fixed(error, 0)} mm."
+    ]
 
 
 def _facts(content: SessionContent, summary: Summary, started: str) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 # A narrow no-break space stands between a number and its unit, and between thousands (ISO 80000-1).
 THIN = "\u202f"
 ABSENT = "–"
+_EMPTY: tuple[object, ...] = ("", ABSENT, (ABSENT, ""))
 
 # A stamp after 2000-01-01 counts from the epoch: no log counts 30 years since its own start.
 EPOCH_SINCE_NS = 946_684_800_000_000_000
@@ -69,6 +70,12 @@ class Table:
     columns: Sequence[Column]
     rows: Sequence[Sequence[object]]  # a text, or a pair of it and a smaller one below
     kind: str = ""  # classes of the style sheet
+
+    def without_empty_columns(self) -> Table:
+        """Leave out columns in which no row has a value."""
+        kept = [k for k in range(len(self.columns)) if any(row[k] not in _EMPTY for row in self.rows)]
+        rows = [[row[k] for k in kept] for row in self.rows]
+        return replace(self, columns=[self.columns[k] for k in kept], rows=rows)
 
 
 def with_interval(
