@@ -237,6 +237,7 @@ class Adjusted:
     left: PoseErrors | None  # errors that remain; None where refused
     modes: Float  # [T, 6, R] of the errors that remain (`ErrorModes`), but for a constant shift
     shift_m: float  # standard deviation of that shift
+    turn: Float  # [3] rad, mean rotation error that was taken off
     prior: PosePrior  # with levels as estimated
     points: int  # that were used
     reprojection_px: float  # median; NaN where there is no solution
@@ -293,7 +294,17 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
         stays = prior.covariance(len(position))
         none = np.empty((len(position), 6, 0))
         return Adjusted(
-            position, rotation, stays, None, none, prior.constant[0], prior, 0, reprojection_px, reason
+            position,
+            rotation,
+            stays,
+            None,
+            none,
+            prior.constant[0],
+            np.zeros(3),
+            prior,
+            0,
+            reprojection_px,
+            reason,
         )
 
     if not len(posed):
@@ -336,6 +347,7 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
         replace(left[len(left) // 2], assumed=prior.assumed),
         modes,
         float(np.hypot(prior.constant[0], results[len(results) // 2].place_m)),
+        errors[posed, 3:].mean(axis=0),
         results[len(results) // 2].prior,
         points,
         pixels,
@@ -1096,7 +1108,13 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:
         sigma=np.sqrt(variances.mean(axis=2)),
         covariance=covariance,
         errors=found.left,
-        modes=ErrorModes(t_ns[posed][::every], found.modes[posed][::every], found.shift_m),
+        modes=ErrorModes(
+            t_ns[posed][::every],
+            found.modes[posed][::every],
+            found.shift_m,
+            found.turn,
+            found.prior.constant[1],
+        ),
         loosened=_loosened_still(camera.loosened_at(t_ns[posed]), variances.mean(axis=2)),
     )
 

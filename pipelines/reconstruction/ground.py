@@ -11,7 +11,9 @@ Only differences are found. The mean error of all bound cameras keeps its prior;
 together and is given apart as a covariance that all joints share.
 """
 
-from collections.abc import Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, permutations
 from typing import Any
@@ -24,7 +26,7 @@ from pipelines.geometry.cameras import project, row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, SHIFT_IN_WORLD, USUAL_CONSTANT, USUAL_COUNT, Process
 from pipelines.geometry.poses import cross_matrix, multiply, quaternion_from_rotation_vector
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks, people_boxes
-from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.observations import Camera, ErrorModes
 from pipelines.session.description import Interpolation
 
 # Points of the cloud that were seen in fewer pictures are placed too badly.
@@ -224,20 +226,22 @@ def bind_positions(
             if not len(matches.pair):
                 used = np.zeros_like(used)
                 break
-            _, agree = _solve(matches, prior)
+            _, agree = _solve(matches, _PriorEquations.of(prior))
             both = (matches.pair, matches.pair[agree])
             counts = np.stack([np.bincount(pair, minlength=len(pairs)) for pair in both], axis=1)
             used = (counts[:, 1] >= _FEWEST_PATCHES / share) & (counts[:, 1] > _AGREE * counts[:, 0])
             if not used.any():
                 break
-            solution, _ = _solve(_of_pairs(matches, used), prior)
+            solution, _ = _solve(_of_pairs(matches, used), _PriorEquations.of(prior))
         if used.any():
             break
     if used.any():
         found = _of_pairs(matches, used)
+        turn = np.inf
         for _ in range(_LEVEL_ROUNDS):
             prior = _with_position_level(cameras, prior, solution)
-            solution, _ = _solve(found, prior)
+            turn = min(turn, _rotation_level(cameras, turn, solution))
+            solution, _ = _solve(found, _PriorEquations.of(prior).with_rotations(cameras, turn))
     return _bound(cameras, pairs, counts, used, solution, np.minimum(prior, _prior_sigma(cameras)))
 
 
@@ -641,46 +645,112 @@ def _assumed(cameras: Sequence[Camera]) -> Bool:
     return assumed
 
 
-def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
-    """Solve for all unknowns with a prior [C U] and errors that pairs share; patches [P] that agree."""
-    cut = matches.across
-    spread = (
-        cut @ (matches.covariance[matches.patch] + _MATCH_SIGMA_M**2 * np.eye(3)) @ np.swapaxes(cut, 1, 2)
-    )
-    count = np.bincount(matches.patch, minlength=len(matches.pair))
-    share = 1 / (1 + (count - 1) * _REPEATED)
-    pairs = np.eye(int(matches.pair.max()) + 1)
-    shared = pairs[matches.pair[matches.patch]]
-    of_pair = (shared[:, None, :, None] * np.eye(3)[:, None]).reshape(len(cut), 3, -1)
-    design = cut @ np.concatenate([matches.design, of_pair], axis=2)
-    every = np.concatenate([prior, np.full(3 * len(pairs), _PAIR_SIGMA_M)])
+def _rotated(cameras: Sequence[Camera]) -> Iterator[tuple[ErrorModes, Float]]:
+    """Yield what the background says of cameras of unknown levels, and their mean rotations [3, C U]."""
+    means = _means(cameras)
+    for c, camera in enumerate(cameras):
+        if camera.modes is not None and camera.errors is not None and camera.errors.assumed:
+            yield camera.modes, means[6 * c + 3 : 6 * c + 6]
+
+
+@dataclass(frozen=True)
+class _PriorEquations:
+    """Gaussian prior of all unknowns."""
+
+    precision: Float  # [C U, C U]
+    pull: Float  # [C U] precision times mean
+
+    @classmethod
+    def of(cls, sigma: Float) -> _PriorEquations:
+        """Build that of independent unknowns with mean 0."""
+        return cls(np.diag(sigma**-2.0), np.zeros(len(sigma)))
+
+    def with_rotations(self, cameras: Sequence[Camera], level: float) -> _PriorEquations:
+        """Narrow the constant rotations of logs, of which the backgrounds found a part, to a level (rad)."""
+        precision, pull = self.precision.copy(), self.pull.copy()
+        for modes, mean in _rotated(cameras):
+            more = max(level**-2.0 - modes.turn_sigma**-2.0, 0.0)
+            precision += more * mean.T @ mean
+            pull -= more * modes.turn @ mean
+        return _PriorEquations(precision, pull)
+
+
+def _solve(matches: _Matches, prior: _PriorEquations) -> tuple[_Solution, Bool]:
+    """Solve for all unknowns with a prior and errors that pairs share; patches [P] that agree."""
+    size = len(prior.pull)
+    parts = [_PairEquations.of(matches, number, size) for number in np.unique(matches.pair).tolist()]
+    every = np.diag(np.full(size + 3 * (int(matches.pair.max()) + 1), _PAIR_SIGMA_M**-2.0))
+    every[:size, :size] = prior.precision
     errors = np.zeros(len(every))
-    seen, back_cut = np.einsum("kij,kj->ki", cut, matches.shift), np.swapaxes(cut, 1, 2)
     for k in range(_ROUNDS):
-        loss = max(_LOSS, 16.0 / 2**k)
-        residual = seen - design @ errors
-        square = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(spread), residual)
-        pair = matches.pair[matches.patch]
-        factor = np.ones(len(pairs))
-        for number in np.unique(pair).tolist():
-            factor[number] = max(1.0, float(np.median(square[pair == number])) / _MEDIAN_OF_TWO)
-        scale = (1 / factor)[matches.pair]
-        weight = (share * scale)[matches.patch] / (1 + square / loss**2) / _MATCH_SIGMA_M**2
-        # The error of a patch's place is common to its comparisons: it is eliminated.
-        by_place = _sums(back_cut @ cut * weight[:, None, None], matches.patch, len(count))
-        mixed = _sums(np.swapaxes(design, 1, 2) @ cut * weight[:, None, None], matches.patch, len(count))
-        pull = _sums(np.einsum("kji,kj->ki", cut, seen) * weight[:, None], matches.patch, len(count))
-        back = mixed @ np.linalg.inv(by_place + np.linalg.inv(matches.covariance) * scale[:, None, None])
-        weighed = design * weight[:, None, None]
-        normal = np.tensordot(weighed, design, ([0, 1], [0, 1])) - np.tensordot(back, mixed, ([0, 2], [0, 2]))
-        right = np.tensordot(weighed, seen, ([0, 1], [0, 1])) - np.tensordot(back, pull, ([0, 2], [0, 1]))
-        covariance = np.linalg.inv(normal + np.diag(every**-2.0))
+        normal, right = every.copy(), np.append(prior.pull, np.zeros(len(every) - size))
+        for part in parts:
+            part.add(normal, right, errors, max(_LOSS, 16.0 / 2**k))
+        covariance = np.linalg.inv(normal)
         errors = covariance @ right
-    residual = seen - design @ errors
-    square = np.einsum("ki,kij,kj->k", residual, np.linalg.inv(spread), residual)
-    agree = np.bincount(matches.patch, square < _AGREEING, len(count)) > count / 2
-    own = slice(len(prior))
-    return _Solution(errors[own], covariance[own, own]), agree
+    agree = np.concatenate([part.agree(errors) for part in parts])
+    return _Solution(errors[:size], covariance[:size, :size]), agree
+
+
+@dataclass(frozen=True)
+class _PairEquations:
+    """Equations of K comparisons of one pair of cameras, which have few of the unknowns."""
+
+    columns: Int64  # [N] of the unknowns: those of both cameras, and the pair's own three
+    design: Float  # [K, 2, N]
+    seen: Float  # [K, 2] m
+    cut: Float  # [K, 2, 3] directions across the ray
+    information: Float  # [K, 2, 2] 1/m^2, of one comparison
+    patch: Int64  # [K]
+    place: Float  # [P, 3, 3] 1/m^2, information on each patch's place
+
+    @classmethod
+    def of(cls, matches: _Matches, pair: int, size: int) -> _PairEquations:
+        """Take those of a pair; the pairs' own unknowns come after so many."""
+        rows = np.flatnonzero(matches.pair[matches.patch] == pair)
+        design, cut = matches.design[rows], matches.across[rows]
+        used = np.flatnonzero(design.any(axis=(0, 1)))
+        own = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+        names, patch = np.unique(matches.patch[rows], return_inverse=True)
+        covariance = matches.covariance[names]
+        spread = cut @ (covariance[patch] + _MATCH_SIGMA_M**2 * np.eye(3)) @ np.swapaxes(cut, 1, 2)
+        return cls(
+            np.append(used, size + 3 * pair + np.arange(3)),
+            cut @ np.concatenate([design[..., used], own], axis=2),
+            np.einsum("kij,kj->ki", cut, matches.shift[rows]),
+            cut,
+            np.linalg.inv(spread),
+            patch,
+            np.linalg.inv(covariance),
+        )
+
+    def squares(self, errors: Float) -> Float:
+        """Compute the squares of residuals [K] in standard deviations."""
+        residual = self.seen - self.design @ errors[self.columns]
+        return np.asarray(np.einsum("ki,kij,kj->k", residual, self.information, residual))
+
+    def agree(self, errors: Float) -> Bool:
+        """Find the patches [P] of which most comparisons agree."""
+        agreeing = np.bincount(self.patch, self.squares(errors) < _AGREEING)
+        return np.asarray(agreeing > np.bincount(self.patch) / 2)
+
+    def add(self, normal: Float, right: Float, errors: Float, loss: float) -> None:
+        """Add them to the normal equations of all unknowns, weighed by the residuals of these `errors`."""
+        square, patches = self.squares(errors), len(self.place)
+        scale = 1 / max(1.0, float(np.median(square)) / _MEDIAN_OF_TWO)
+        share = 1 / (1 + (np.bincount(self.patch) - 1) * _REPEATED)
+        weight = scale * share[self.patch] / (1 + square / loss**2) / _MATCH_SIGMA_M**2
+        back_cut, back_design = (np.swapaxes(each, 1, 2) for each in (self.cut, self.design))
+        # The error of a patch's place is common to its comparisons: it is eliminated.
+        by_place = _sums(back_cut @ self.cut * weight[:, None, None], self.patch, patches)
+        mixed = _sums(back_design @ self.cut * weight[:, None, None], self.patch, patches)
+        pull = _sums((back_cut @ self.seen[..., None])[..., 0] * weight[:, None], self.patch, patches)
+        back = mixed @ np.linalg.inv(by_place + scale * self.place)
+        weighed = self.design * weight[:, None, None]
+        own = np.tensordot(weighed, self.design, ([0, 1], [0, 1]))
+        normal[np.ix_(self.columns, self.columns)] += own - np.tensordot(back, mixed, ([0, 2], [0, 2]))
+        right[self.columns] += np.tensordot(weighed, self.seen, ([0, 1], [0, 1]))
+        right[self.columns] -= np.tensordot(back, pull, ([0, 2], [0, 1]))
 
 
 # --- cameras -----------------------------------------------------------------------------------------------
@@ -771,6 +841,16 @@ def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Sol
     squares = float(np.sum(solution.errors[assumed] ** 2))
     level2 = (squares + USUAL_COUNT * USUAL_CONSTANT[0] ** 2) / (max(determined, 0.0) + USUAL_COUNT)
     return np.where(assumed, np.minimum(prior, np.sqrt(level2)), prior)
+
+
+def _rotation_level(cameras: Sequence[Camera], level: float, solution: _Solution) -> float:
+    """Estimate the level (rad) of constant rotations by the same rule; infinite where none is assumed."""
+    squares, determined = 0.0, 0.0
+    for modes, mean in _rotated(cameras):
+        before = min(level, modes.turn_sigma)
+        squares += float(np.sum((modes.turn + mean @ solution.errors) ** 2))
+        determined += max(3.0 - float(np.trace(mean @ solution.covariance @ mean.T)) / before**2, 0.0)
+    return float(np.sqrt((squares + USUAL_COUNT * USUAL_CONSTANT[1] ** 2) / (determined + USUAL_COUNT)))
 
 
 def _largest_group(total: int, edges: Sequence[tuple[int, int]]) -> list[int]:
