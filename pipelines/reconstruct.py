@@ -139,7 +139,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=42)
+RECONSTRUCT = Stage("reconstruct", revision=43)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -570,14 +570,14 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         cameras = shifted(cameras, clocks.offset_s)
     logged = cameras
     background: dict[str, Any] = {"background": None}
-    warnings: list[str] = []
+    warnings = [] if clocks is None else clocks.warnings()
     if flight.followed:
         errors = flight.errors(cameras)
-        cameras, background["background"], warnings = refine_cameras(
+        cameras, background["background"], stayed = refine_cameras(
             cameras, flight.followed, errors, between=flight.between
         )
         cameras, moved = _brought_together(flight, cameras, errors)
-        warnings += moved
+        warnings += [*stayed, *moved]
         cameras = flight.waiting.put(cameras)
     binding = None
     if len(flight.stills) > 1:

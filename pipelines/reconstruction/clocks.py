@@ -26,11 +26,8 @@ SEARCH_STEP_S = 1 / 15
 # An offset is searched to two standard deviations of what is stated of it.
 SEARCH_REACH_SIGMAS = 2.0
 
-# Chance lowers the disagreement of views with unknown clocks by up to a tenth.
-MAX_DISAGREEMENT_RATIO = 0.8
-
-# Half of the joints swing too little to show a clock, and some views are wrong.
-DISAGREEMENT_PERCENTILE = 75.0
+# At most offsets, views must disagree more than at the best one by so many times what chance does.
+MIN_CONTRAST = 2.0
 
 # A stated clock is questioned with this prior (s): mistaken starts are off by up to a second.
 QUESTIONED_SIGMA_S = 0.5
@@ -90,12 +87,20 @@ class FoundClocks:
     prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
     common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
     wrong: Mapping[str, str] = field(default_factory=dict)  # evidence against each stated clock that is moved
+    undetermined: tuple[str, ...] = ()  # cameras whose clocks pictures do not determine
 
     def with_others(self, found: FoundClocks) -> FoundClocks:
         """Add the offsets that keypoints show for cameras that these already shift; their deviations stay."""
         sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
         wrong = {**found.wrong, **self.wrong}
         return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s, wrong=wrong)
+
+    def warnings(self) -> list[str]:
+        """List clocks that pictures do not determine: nobody moved, or straight camera paths compensate."""
+        return [
+            f"the videos do not determine the clock of {name}; it stays within what is stated of it"
+            for name in self.undetermined
+        ]
 
     def as_metrics(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Return what metrics.json says of the clocks of all cameras."""
@@ -119,30 +124,49 @@ def is_wrong(offset_s: Float, sigma_s: Float) -> Bool:
     return np.asarray(np.abs(offset_s) > least_s)
 
 
-def initial_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
-    """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks, or if none is.
+def searched_offsets_s(
+    views_at: Callable[[float], Views], t_s: Float, clock_sigma_s: Float
+) -> tuple[Float, Bool]:
+    """Find offsets [C] s of unknown clocks where views agree best, to a fine step, and if rays show them [C].
 
     `views_at` returns the views with all unknown clocks moved forward by seconds, the same number of
-    joint-frames at each of the `instants`; `clock_sigma_s` [C] is 0 for a known clock.
+    joint-frames at each of the times `t_s` [T]; `clock_sigma_s` [C] is 0 for a known clock. Where nobody
+    moves, views agree equally well at all offsets but for chance; such clocks stay. So do all if none is
+    known.
     """
-    initial_s = np.zeros(len(clock_sigma_s))
+    found_s, shown = np.zeros(len(clock_sigma_s)), np.zeros(len(clock_sigma_s), dtype=np.bool_)
     unknown = np.flatnonzero(clock_sigma_s > 0)
-    if not len(unknown) or len(unknown) == len(initial_s):
-        return initial_s
-    steps = int(SEARCH_REACH_SIGMAS * clock_sigma_s.max() / SEARCH_STEP_S)
-    shifts_s = SEARCH_STEP_S * np.arange(-steps, steps + 1)
-    disagreement = np.full((len(shifts_s), len(initial_s)), np.inf)
-    for row, shift_s in enumerate(shifts_s):
-        views = views_at(float(shift_s))
-        for camera in unknown[np.abs(shift_s) <= SEARCH_REACH_SIGMAS * clock_sigma_s[unknown]]:
-            beside = views.of((clock_sigma_s == 0) | (np.arange(len(initial_s)) == camera))
-            own = int((clock_sigma_s[:camera] == 0).sum())
-            disagreement[row, camera] = _disagreement_px(beside, instants, own)
-    for camera in unknown:
-        best = int(np.argmin(disagreement[:, camera]))
-        if disagreement[best, camera] < MAX_DISAGREEMENT_RATIO * disagreement[steps, camera]:
-            initial_s[camera] = shifts_s[best]
-    return initial_s
+    if not len(unknown) or len(unknown) == len(found_s):
+        return found_s, shown
+    window, at = _window(t_s), {}
+
+    def logarithm(camera: int, shift_s: float) -> tuple[float, Float]:
+        if shift_s not in at:
+            at[shift_s] = views_at(shift_s)
+        beside = at[shift_s].of((clock_sigma_s == 0) | (np.arange(len(found_s)) == camera))
+        missed = _missed_px(beside, len(t_s), int((clock_sigma_s[:camera] == 0).sum()))
+        enough = len(missed) >= FEWEST_TIMES
+        return (float(np.log(_changing_px(missed, window))) if enough else np.inf), missed
+
+    for camera in unknown.tolist():
+        steps = int(SEARCH_REACH_SIGMAS * clock_sigma_s[camera] / SEARCH_STEP_S)
+        if not steps:
+            shown[camera] = True  # elsewhere
+            continue
+        shifts_s = SEARCH_STEP_S * np.arange(-steps, steps + 1)
+        logarithms = np.array([logarithm(camera, each)[0] for each in shifts_s.tolist()])
+        if not np.isfinite(logarithms).any():
+            continue
+        best_s = float(shifts_s[np.argmin(logarithms)])
+        count = _independent(logarithm(camera, best_s)[1])
+        cost = 2 * count * logarithms + (shifts_s / clock_sigma_s[camera]) ** 2
+        best_s = float(shifts_s[np.argmin(cost)])
+        # Of so many independent residuals, twice the logarithm of the rms varies by this.
+        shown[camera] = np.median(cost) - cost.min() > MIN_CONTRAST * np.sqrt(2 * count)
+        if shown[camera] and best_s != 0:
+            around_s = best_s + FINE_STEP_S * np.arange(-FINE_STEPS, FINE_STEPS + 1)
+            found_s[camera] = min(around_s.tolist(), key=lambda each: logarithm(camera, each)[0])
+    return found_s, shown
 
 
 def wrong_clocks(views_at: Callable[[float], Views], t_s: Float, questioned: Bool, reference: int) -> Float:
@@ -157,7 +181,7 @@ def wrong_clocks(views_at: Callable[[float], Views], t_s: Float, questioned: Boo
     shifts_s = np.union1d(shifts_s, [-2 * FINE_STEP_S, 2 * FINE_STEP_S])
     at = {shift_s: views_at(shift_s) for shift_s in shifts_s.tolist()}
     offset_s, current, open_ = np.zeros(len(questioned)), at[0.0], np.flatnonzero(questioned).tolist()
-    window = LASTING_S / max(float(np.median(np.diff(t_s))), 1e-3) if len(t_s) > 1 else 1.0
+    window = _window(t_s)
 
     def missed_px(camera: int, shift_s: float) -> Float:
         if shift_s not in at:
@@ -216,10 +240,9 @@ def _with_camera(views: Views, other: Views, camera: int) -> Views:
     return replace(views, rays=rays, weight=weight, position=position, rotation=rotation)
 
 
-def _disagreement_px(views: Views, instants: int, camera: int) -> float:
-    """Compute the disagreement of views (px), beside each view's median, where one camera sees something."""
-    own = np.linalg.norm(_missed_px(views, instants, camera), axis=-1)
-    return float(np.nanpercentile(own, DISAGREEMENT_PERCENTILE)) if np.isfinite(own).any() else np.inf
+def _window(t_s: Float) -> float:
+    """Count the times over which the mean residual of a joint is a lasting error."""
+    return LASTING_S / max(float(np.median(np.diff(t_s))), 1e-3) if len(t_s) > 1 else 1.0
 
 
 def _changing_px(missed: Float, window: float) -> float:

@@ -242,7 +242,7 @@ def bind_positions(
             prior = _with_position_level(cameras, prior, solution)
             turn = min(turn, _rotation_level(cameras, turn, solution))
             solution, _ = _solve(found, _PriorEquations.of(prior).with_rotations(cameras, turn))
-    return _bound(cameras, pairs, counts, used, solution, np.minimum(prior, _prior_sigma(cameras)))
+    return _bound(cameras, pairs, counts, used, solution, _prior_sigma(cameras))
 
 
 # --- clouds ----------------------------------------------------------------------------------------------
@@ -719,9 +719,9 @@ class _PairEquations:
             cut @ np.concatenate([design[..., used], own], axis=2),
             np.einsum("kij,kj->ki", cut, matches.shift[rows]),
             cut,
-            np.linalg.inv(spread),
+            np.asarray(np.linalg.inv(spread), np.float64),
             patch,
-            np.linalg.inv(covariance),
+            np.asarray(np.linalg.inv(covariance), np.float64),
         )
 
     def squares(self, errors: Float) -> Float:

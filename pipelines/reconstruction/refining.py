@@ -40,7 +40,7 @@ from pipelines.reconstruction.clocks import (
     QUESTIONED_SIGMA_S,
     SEARCH_STEP_S,
     FoundClocks,
-    initial_offsets_s,
+    searched_offsets_s,
     wrong_clocks,
 )
 from pipelines.reconstruction.observations import (
@@ -190,10 +190,9 @@ def doubted_people(
 
 def refine_flight(flight: RobustFlight) -> RefinedFlight:
     """Refine the result of `robust` for a flight."""
-    refined, offset_s = _settle_clocks(flight, _initial_clock_offsets_s(flight))
+    refined, offset_s = _settle_clocks(flight, np.zeros(len(flight.cameras)))
     warnings = [
         *refined.warnings,
-        *_undetermined_clocks(refined, flight.cameras, flight.clock_sigma_s),
         *_unsettled_clocks(refined, flight.cameras),
     ]
     metrics = _metrics(refined, flight, offset_s)
@@ -220,20 +219,26 @@ def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
 
     Limbs are enough for that: fingers and faces move with them, and would take most of the time.
 
-    A clock whose offset nobody stated (False in `stated` [C]) is held unless the search finds that views
-    agree clearly better elsewhere. Lasting keypoint errors can pull a right clock by many standard
-    deviations: by 40 ms in a real recording with synchronised cameras.
+    A clock that rays do not show, because nobody moves, is held. So is one whose offset nobody stated (False
+    in `stated` [C]) unless the search finds a whole step: lasting keypoint errors can pull a right clock by
+    many standard deviations, by 40 ms in a real recording with synchronised cameras.
     """
-    searched_s = _initial_clock_offsets_s(flight)
-    prior_s = np.where(stated | (searched_s != 0), flight.clock_sigma_s, 0.0)
-    held = FoundClocks(searched_s, prior_s, prior_s)
-    if not prior_s.any():
-        return held
-    limbs = replace(flight, clock_sigma_s=prior_s, only_limbs=True)
-    refined, offset_s = _settle_clocks(limbs, searched_s)
-    if refined.fallback is not None:
-        return held
-    return FoundClocks(offset_s, refined.clock_sigma_s, prior_s)
+    unknown_s, names = flight.clock_sigma_s, [camera.name for camera in flight.cameras]
+    views_at, rows = _views_at(flight, unknown_s > 0)
+    searched_s, shown = searched_offsets_s(views_at, flight.t_s[rows], unknown_s)
+    searched_s = np.where(stated | (np.abs(searched_s) >= SEARCH_STEP_S), searched_s, 0.0)
+    prior_s = np.where(shown & (stated | (searched_s != 0)), unknown_s, 0.0)
+    offset_s, sigma_s = searched_s, np.where(shown, FINE_STEP_S * (searched_s != 0), stated * unknown_s)
+    if prior_s.any():
+        limbs = replace(flight, clock_sigma_s=prior_s, only_limbs=True)
+        refined, settled_s = _settle_clocks(limbs, searched_s)
+        settled = (prior_s > 0) & (np.abs(settled_s - searched_s) < SEARCH_STEP_S)
+        settled &= refined.fallback is None
+        offset_s = np.where(settled, settled_s, searched_s)
+        sigma_s = np.where(settled, refined.clock_sigma_s, sigma_s)
+        prior_s = np.where(settled, prior_s, 0.0)
+    undetermined = np.array(names)[sigma_s > _UNDETERMINED * unknown_s].tolist()
+    return FoundClocks(offset_s, sigma_s, prior_s, undetermined=tuple(undetermined))
 
 
 def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, reference: str) -> FoundClocks:
@@ -263,12 +268,6 @@ def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, refere
     return FoundClocks(
         offset_s, sigma_s, none, wrong=dict.fromkeys(np.array(names)[wrong].tolist(), "keypoints")
     )
-
-
-def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
-    """Find the initial offset [C] s of every clock from some times of the flight, see `initial_offsets_s`."""
-    views_at, rows = _views_at(flight, flight.clock_sigma_s > 0)
-    return initial_offsets_s(views_at, len(flight.t_s[rows]), flight.clock_sigma_s)
 
 
 def _views_at(flight: RobustFlight, moved: Bool) -> tuple[Callable[[float], Views], slice]:
@@ -301,6 +300,7 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
         held = replace(flight, clock_sigma_s=np.zeros_like(offset_s))
         refined = _refine_with_offsets(held, offset_s, _start_with_offsets(flight, offset_s))
         return replace(refined, clock_sigma_s=settled.clock_sigma_s), offset_s
+    before_s = np.zeros_like(offset_s)
     for _ in range(1 + _MOST_SHIFTS):
         refined = _refine_with_offsets(flight, offset_s, started)
         # This estimate had a prior with mean 0 at the shifted stamps. The stated one has mean 0 at the given
@@ -309,7 +309,8 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
             refined.clock_sigma_s / np.where(flight.clock_sigma_s > 0, flight.clock_sigma_s, np.inf)
         )
         moved_s = refined.clock_offset_s - kept * offset_s
-        offset_s = offset_s + moved_s
+        moved_s = np.where(moved_s * before_s < 0, moved_s / 2, moved_s)  # offsets that swing to and fro
+        offset_s, before_s = offset_s + moved_s, moved_s
         if (np.abs(moved_s) <= np.maximum(SETTLED_S, refined.clock_sigma_s)).all():
             break
         started = _start_with_offsets(flight, offset_s)
@@ -353,16 +354,6 @@ def _start_with_offsets(flight: RobustFlight, offset_s: Float) -> Float:
         )
         start[own] = found.points.reshape(-1, *start.shape[1:])
     return start
-
-
-def _undetermined_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:
-    """List clocks that pictures do not determine: nothing moved, or straight camera paths compensate."""
-    return [
-        f"refined: the videos do not determine the clock of {camera.name}: the sigma of its offset is "
-        f"{sigma:.2g} s ({prior:.2g} s stated)"
-        for camera, sigma, prior in zip(cameras, refined.clock_sigma_s, prior_s, strict=True)
-        if refined.fallback is None and prior > 0 and sigma > _UNDETERMINED * prior
-    ]
 
 
 def _unsettled(refined: Refined) -> Bool:

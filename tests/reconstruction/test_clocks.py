@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import Bias, NoiseModel, White, pose_errors
 from pipelines.geometry.triangulation import Views
-from pipelines.reconstruction.clocks import initial_offsets_s
+from pipelines.reconstruction.clocks import searched_offsets_s
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from pipelines.reconstruction.refinement.system import Sighting
 from tests.reconstruction.formations import BONES, FOCAL_PX, Formation, formation
@@ -65,15 +65,15 @@ def seen(flight: Formation, shift_s: float, unknown: NDArray[np.bool_]) -> Views
     )
 
 
-def initial_offsets(flight: Formation, sigma_s: Float) -> Float:
-    return initial_offsets_s(lambda shift_s: seen(flight, shift_s, sigma_s > 0), TIMES, sigma_s)
+def searched_offsets(flight: Formation, sigma_s: Float) -> Float:
+    return searched_offsets_s(lambda shift_s: seen(flight, shift_s, sigma_s > 0), flight.t_s, sigma_s)[0]
 
 
 @pytest.mark.parametrize("models", [[], ROUGH], ids=["exact", "rough"])
 @pytest.mark.parametrize("late_s", [LATE_S, -LATE_S])
 def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: float) -> None:
     flight = formation(TIMES, 3, models, 0, late_s=(0.0, late_s, 0.0))
-    found = initial_offsets(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
+    found = searched_offsets(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
     assert found[0] == 0.0
     np.testing.assert_allclose(found[1:], [late_s, 0.0], atol=STEP_S)
 
@@ -81,14 +81,14 @@ def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: floa
 def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:
     flight = formation(TIMES, 3, [], 0, late_s=(0.0, 0.0, LATE_S))
     flight.sightings[1].rays[40:80] = np.nan
-    found = initial_offsets(flight, np.array([0.0, 0.0, SIGMA_S]))
+    found = searched_offsets(flight, np.array([0.0, 0.0, SIGMA_S]))
     np.testing.assert_allclose(found, [0.0, 0.0, LATE_S], atol=STEP_S)
 
 
 def test_no_offset_is_searched_where_all_clocks_are_known_or_none() -> None:
     flight = formation(TIMES, 2, [], 0, late_s=(0.0, LATE_S))
-    assert not initial_offsets(flight, np.zeros(2)).any()
-    assert not initial_offsets(flight, np.full(2, SIGMA_S)).any()
+    assert not searched_offsets(flight, np.zeros(2)).any()
+    assert not searched_offsets(flight, np.full(2, SIGMA_S)).any()
 
 
 def test_who_stands_still_leaves_clocks_where_they_are() -> None:
@@ -96,4 +96,4 @@ def test_who_stands_still_leaves_clocks_where_they_are() -> None:
     rng = np.random.default_rng(0)
     for sighting in flight.sightings:
         sighting.rays[:] = sighting.rays[:1] + rng.normal(0, 2 / FOCAL_PX, sighting.rays.shape)
-    assert not initial_offsets(flight, np.array([0.0, SIGMA_S])).any()
+    assert not searched_offsets(flight, np.array([0.0, SIGMA_S])).any()
