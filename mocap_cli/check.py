@@ -54,6 +54,11 @@ def check_command(
     if not result.doubts:
         looked = f" (looked at: {result.pictures})" if result.pictures else ""
         say(f"{path}: no doubt{looked}")
-    follows = "mocap check --fix {}" if result.doubts and not fix else "mocap ingest {}"
+    follows = "mocap ingest {}"
+    if result.doubts and not fix:
+        can_mend = any(doubt.instructions for doubt in result.doubts)
+        follows = (
+            "mocap check --fix {}" if can_mend else "correct what docs/mistakes.md names, then mocap check {}"
+        )
     say_next(follows if path.suffix in {".yaml", ".yml"} else "mocap reconstruct {}", path, shown.quiet)
     return None

@@ -40,6 +40,7 @@ def init_command(
         _write_example(example, output, overwrite, shown)
         return
     from pipelines.draft import draft
+    from pipelines.ingest import OF_ONE_CAMERA
     from pipelines.session.storage import jsonable
 
     with watching(shown.level) as progress:
@@ -60,6 +61,8 @@ def init_command(
         }
         print_json(jsonable(summary))
     else:
+        if len(result.cameras) == 1 and not shown.quiet:
+            say(OF_ONE_CAMERA, err=True)
         say(f"cameras: {', '.join(result.cameras) or 'none'}")
         say(f"written: {_from_here(result.path)}")
         if result.cameras:

@@ -381,7 +381,7 @@ def _raise_if_nothing_was_measured(folder: Path, attempt: Attempt, doubts: Seque
     why = [f"{gates}, {noise_text(attempt.views)}", *attempt.association.reasons]
     if causes:  # what explains nearly as much is said beside the first
         why = [", or ".join(doubt.what for doubt in causes)]
-    advice = "check calibration, clocks and poses, or state another pose noise with --pose-noise"
+    advice = f"`mocap check {folder}` looks for the mistake; or state another pose noise with --pose-noise"
     raise DataError(
         folder,
         "; ".join(["no joint could be reconstructed", *why]),

@@ -46,6 +46,11 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
     if name is not None:
         stated = FORMATS.get(name)
         if isinstance(stated, protocols):
+            if path.is_file() and not stated.recognises(path):
+                others = [f.title for f in FORMATS.all() if isinstance(f, protocols) and f.recognises(path)]
+                if others:
+                    problem = f"is no {stated.title} but {' or '.join(others)}"
+                    raise DataError(path, problem, "leave `format:` out", code="wrong-kind")
             return stated
         raise DataError(path, f"{name} is no format of a {noun}", "leave `format:` out", code="wrong-kind")
     if not (path.exists() or is_folder(path)):

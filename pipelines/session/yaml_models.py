@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Annotated, Any, ClassVar, Self, get_args, get_origin
 
@@ -18,10 +19,19 @@ def nanoseconds(value: object) -> int:
         exact = Decimal(str(value)) * 1_000_000_000
         is_near = abs(exact) <= LATEST_NS  # before it becomes an integer of as many digits
     except ArithmeticError:
-        raise ValueError("is no time in seconds") from None
+        raise ValueError(f"is no time in seconds{_seconds_of(str(value))}") from None
     if not is_near:
         raise ValueError("is no time in seconds: it lies beyond the year 2116 (are these ms or ns?)")
     return int(exact.to_integral_value())
+
+
+def _seconds_of(date: str) -> str:
+    """Say a date in seconds; without a zone it counts as UTC. Empty for another text."""
+    try:
+        moment = datetime.fromisoformat(date)
+    except ValueError:
+        return ", such as 1700000000.25 since 1970 or 12.5 since a log's start"
+    return f": {date} is {(moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp():.3f}"
 
 
 SecondsAsNs = Annotated[int, BeforeValidator(nanoseconds)]
