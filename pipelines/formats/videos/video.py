@@ -44,6 +44,9 @@ _MOST_KEY_FRAMES = 3
 _MOST_PIXELS = 1 << 27
 # A codec's noise stays below this brightness (of 255) in black bars.
 _BLACK = 16
+# Where two pictures of MPEG-4 are packed into one packet, or one is left out, a placeholder has fewer bytes
+# (FFmpeg's MAX_NVOP_SIZE).
+_NVOP_BYTES = 20
 # Brightness weighs the channels so (ITU-R BT.601).
 _EYE_BGR = (0.114, 0.587, 0.299)
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
@@ -51,6 +54,8 @@ _PACKET_TS, _PACKET_M2TS = 188, 192
 # Phones halve their rate in the dark. A lost frame doubles an interval.
 _GAP = 1.5
 _NOT_GIVEN = "not given by a decoder, before the first key frame or after a lost frame"
+# More pictures before a key frame are rather a shorter sequence than lost ones.
+_MOST_LOST = 3
 # The first bytes of containers, and FFmpeg's names of them.
 _MAGIC = {
     b"\x1a\x45\xdf\xa3": "matroska",
@@ -302,6 +307,7 @@ class _Scan:
     key_frames: list[int]  # sorted numbers, of stamps that no other frame has
     dropped: dict[str, int]
     is_raw: bool = False
+    in_order: bool = False  # decoded from the beginning, without seeking
     damaged: int = 0  # coded frames whose bytes are not as a codec writes them
 
 
@@ -312,6 +318,7 @@ class _CodedFrame(NamedTuple):
     pts: int | None
     key: bool
     sound: bool
+    size: int
 
 
 def _scan(path: Path) -> _Scan:
@@ -330,7 +337,9 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         codec = stream.codec_context.codec.canonical_name
         lengths = _bytes_of_lengths(codec, stream.codec_context.extradata or b"")
         stored = [
-            _CodedFrame(packet.pos, packet.pts, packet.is_keyframe, _is_sound(packet, codec, lengths))
+            _CodedFrame(
+                packet.pos, packet.pts, packet.is_keyframe, _is_sound(packet, codec, lengths), packet.size
+            )
             for packet in packets(container, stream)
             if not packet.is_discard and is_shown(packet, codec)
         ]
@@ -338,18 +347,9 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
         tick_s, listed = Fraction(stream.time_base or 0), stream.frames
         is_raw = container.format.name in _RAW
-    if is_raw:
-        container, stream = open_container(path)
-        with container:
-            found = [frame.pts or 0 for frame in _decoded(container, stream, None)]
-        if not found:
-            raise _undecodable(path, len(stored))
-        unseen = sorted(set(range(len(stored))) - set(found))
-        # Each of them before it in the stream moves a picture by one.
-        before = np.array([bisect.bisect_left(unseen, number) for number in found], np.int64)
-        numbers: Int64 = np.arange(len(found)) + np.maximum.accumulate(before)
-        dropped = {_NOT_GIVEN: len(unseen)} if unseen else {}
-        return _Scan(numbers - numbers[0], Fraction(1), [], dropped, is_raw)
+    is_packed = codec == "mpeg4" and min((packet.size for packet in stored), default=99) < _NVOP_BYTES
+    if is_raw or is_packed:
+        return _scan_in_order(path, len(stored), Fraction(1) if is_raw else tick_s)
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
@@ -386,6 +386,28 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         {cause: count for cause, count in counts.items() if count},
         damaged=sum(not packet.sound for packet in whole),
     )
+
+
+def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
+    """Decode a stream whose packets do not say what is shown when: a raw one, or packed MPEG-4."""
+    container, stream = open_container(path)
+    with container:
+        is_raw, codec = container.format.name in _RAW, stream.codec_context.codec.canonical_name
+        shown = [(frame.pts, frame.dts) for frame in _decoded(container, stream, None)]
+    if not shown:
+        raise _undecodable(path, stored)
+    if is_raw:
+        found = [pts or 0 for pts, _ in shown]
+        container, stream = open_container(path)
+        with container:
+            numbers = _numbers_by_order(found, _orders(packets(container, stream), codec, set(found)))
+        unseen = int(numbers[-1]) + 1 - len(found) + min(found) + stored - 1 - max(found)
+        return _Scan(numbers, tick_s, [], {_NOT_GIVEN: unseen} if unseen else {}, True, True)
+    # As FFmpeg does: where the stamps of showing go back, those of decoding count.
+    by_pts = np.array([-1 if pts is None else pts for pts, _ in shown], np.int64)
+    by_dts = np.array([-1 if dts is None else dts for _, dts in shown], np.int64)
+    ticks, count = by_pts if (np.diff(by_pts) > 0).all() else by_dts, np.arange(len(shown))
+    return _Scan(np.maximum.accumulate(ticks - count) + count, tick_s, [], {}, False, True)
 
 
 def _key_frames(ticks: Int64, keys: Int64) -> list[int]:
@@ -454,6 +476,11 @@ def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
         ends_ns = np.append(pts_ns[starts], pts_ns[-1] + step_ns)
         pts_ns = np.interp(np.arange(len(pts_ns)), np.append(starts, len(pts_ns)), ends_ns).astype(np.int64)
         notes = (f"{again} frames have the stamp of the frame before: spread up to the next stamp",)
+    if scan.is_raw:
+        notes += (
+            "a raw stream has no times: lost pictures are counted by what the others say of their order,"
+            " which may be wrong next to a key frame",
+        )
     if scan.damaged:
         notes += (
             f"{scan.damaged} coded frames are damaged: they keep their numbers, and a detector that leaves"
@@ -477,6 +504,224 @@ def _nanoseconds(ticks: Int64, tick_s: Fraction, origin: int = 0) -> Int64:
     return np.array(
         [(2 * (t - origin) * above + below) // (2 * below) for t in ticks.tolist()], dtype=np.int64
     )
+
+
+# --- order of raw streams --------------------------------------------------------------------------------
+
+
+class _Order(NamedTuple):
+    """Place of a coded picture in the order of showing."""
+
+    sequence: int  # from one key frame that refers to nothing before it to the next
+    place: int  # picture order count in the sequence, in steps of one stream
+    is_whole: bool  # False if the key frame of the sequence is lost
+
+
+class _Bits:
+    """Reader of the bits of one unit, whose emulation prevention it removes; ValueError at the end."""
+
+    def __init__(self, unit: bytes) -> None:
+        content = unit.replace(b"\0\0\3", b"\0\0")
+        self._value, self._left = int.from_bytes(content), 8 * len(content)
+
+    def read(self, count: int) -> int:
+        """Read an unsigned number of so many bits."""
+        self._left -= count
+        return self._value >> self._left & ((1 << count) - 1)
+
+    def golomb(self) -> int:
+        """Read an unsigned number of variable length (ITU-T H.264, 9.1)."""
+        zeros = 0
+        while not self.read(1):
+            zeros += 1
+        return (1 << zeros) - 1 + self.read(zeros)
+
+
+# Profiles of H.264 that state their chroma and scaling lists (ITU-T H.264, 7.3.2.1.1).
+_HIGH_PROFILES = {44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244}
+# A picture that no decoder gives is at most so many counts from the one before it.
+_NEAR = 32
+# No header of a picture or a stream is longer, even with all scaling lists.
+_HEADER_BYTES = 1024
+
+
+def _orders(coded: Iterator[Packet[VideoStream]], codec: str, given: set[int]) -> dict[int, _Order]:
+    """Read the place of each coded picture in the order of showing, by number of packet, from its header.
+
+    Empty for other codecs, or if a header cannot be read.
+    """
+    head = _H264Head() if codec == "h264" else _H265Head() if codec == "hevc" else None
+    if head is None:
+        return {}
+    orders: dict[int, _Order] = {}
+    sequence, is_whole, reference = -1, False, 0
+    seen: set[int] = set()
+    try:
+        for number, packet in enumerate(coded):
+            found = head.read(bytes(packet))
+            if found is None:
+                continue
+            starts, is_reference, low, modulus = found
+            # The count of least distance to that of the last reference (ITU-T H.264, 8.2.1; H.265, 8.3.1).
+            half = modulus // 2
+            step = (low - reference + half) % modulus - half
+            if not (starts or number in given or abs(step) <= _NEAR < modulus / 4):
+                continue  # a damaged header
+            count = low if starts else reference + step
+            # A count that was there before is that of a sequence whose first picture is lost.
+            if starts or count in seen or sequence < 0:
+                sequence, is_whole, seen = sequence + 1, starts, set()
+                count = low
+            seen.add(count)
+            orders[number] = _Order(sequence, count, is_whole)
+            reference = count if is_reference or starts else reference
+    except (ValueError, KeyError):
+        return {}
+    return orders
+
+
+class _Coded(NamedTuple):
+    """Header of a coded picture, as far as it says when it is shown."""
+
+    starts: bool  # a sequence
+    is_reference: bool
+    place: int  # picture order count, modulo `modulus`
+    modulus: int
+
+
+class _H264Head:
+    """Reader of H.264's headers, which keeps the parameter sets."""
+
+    def __init__(self) -> None:
+        self._streams: dict[int, tuple[int, int, bool, bool]] = {}
+        self._pictures: dict[int, int] = {}
+
+    def read(self, packet: bytes) -> _Coded | None:
+        """Read the units of a packet up to its first slice; None without one (ITU-T H.264, 7.3)."""
+        for unit in _units(packet):
+            kind, bits = unit[0] & 31, _Bits(unit[1:])
+            if kind == 7:
+                self._read_stream(bits)
+            elif kind == 8:
+                self._pictures[bits.golomb()] = bits.golomb()
+            elif kind in {1, 5}:
+                bits.golomb(), bits.golomb()
+                frame_bits, order_bits, planes, fields = self._streams[self._pictures[bits.golomb()]]
+                bits.read(2 * planes)
+                number = bits.read(frame_bits)
+                if fields and bits.read(1):
+                    bits.read(1)
+                if kind == 5:
+                    bits.golomb()
+                is_reference = bool(unit[0] & 0x60)
+                if order_bits:
+                    return _Coded(kind == 5, is_reference, bits.read(order_bits), 1 << order_bits)
+                return _Coded(kind == 5, is_reference, 2 * number - (not is_reference), 2 << frame_bits)
+        return None
+
+    def _read_stream(self, bits: _Bits) -> None:
+        profile, planes = bits.read(24) >> 16, False
+        name = bits.golomb()
+        if profile in _HIGH_PROFILES:
+            chroma = bits.golomb()
+            planes = chroma == 3 and bool(bits.read(1))
+            bits.golomb(), bits.golomb(), bits.read(1)
+            for k in range(12 if chroma == 3 else 8) if bits.read(1) else ():
+                last = following = 8
+                for _ in range((16 if k < 6 else 64) if bits.read(1) else 0):
+                    if following:
+                        code = bits.golomb()
+                        following = (last + (code + 1) // 2 * (1 if code % 2 else -1)) % 256
+                    last = following or last
+        frame_bits, order_kind, order_bits = bits.golomb() + 4, bits.golomb(), 0
+        if order_kind == 0:
+            order_bits = bits.golomb() + 4
+        elif order_kind == 1:
+            bits.read(1), bits.golomb(), bits.golomb()
+            for _ in range(bits.golomb()):
+                bits.golomb()
+        bits.golomb(), bits.read(1), bits.golomb(), bits.golomb()
+        self._streams[name] = frame_bits, order_bits, planes, not bits.read(1)
+
+
+class _H265Head:
+    """Reader of H.265's headers, which keeps the parameter sets."""
+
+    def __init__(self) -> None:
+        self._streams: dict[int, tuple[int, bool]] = {}
+        self._pictures: dict[int, tuple[int, int, int]] = {}
+
+    def read(self, packet: bytes) -> _Coded | None:
+        """Read the units of a packet up to its first slice; None without one (ITU-T H.265, 7.3)."""
+        for unit in _units(packet):
+            kind, bits = unit[0] >> 1 & 63, _Bits(unit[2:])
+            if kind == 33:
+                self._read_stream(bits)
+            elif kind == 34:
+                name, stream, shown = bits.golomb(), bits.golomb(), bits.read(2) & 1
+                self._pictures[name] = stream, shown, bits.read(3)
+            elif kind < 10 or 16 <= kind <= 21:
+                bits.read(2 if kind >= 16 else 1)
+                stream, shown, extra = self._pictures[bits.golomb()]
+                order_bits, planes = self._streams[stream]
+                bits.read(extra), bits.golomb(), bits.read(shown + 2 * planes)
+                low = 0 if kind in {19, 20} else bits.read(order_bits)
+                is_reference = unit[1] & 7 == 1 and (kind % 2 == 1 or kind >= 16) and kind not in {7, 9}
+                return _Coded(16 <= kind <= 20, is_reference, low, 1 << order_bits)
+        return None
+
+    def _read_stream(self, bits: _Bits) -> None:
+        layers = bits.read(7) & 7
+        bits.read(1 + 96)
+        flags = [bits.read(2) for _ in range(8 if layers else 0)][:layers]
+        for each in flags:
+            bits.read(88 * (each >> 1) + 8 * (each & 1))
+        name, chroma = bits.golomb(), bits.golomb()
+        planes = chroma == 3 and bool(bits.read(1))
+        bits.golomb(), bits.golomb()
+        for _ in range(4 if bits.read(1) else 0):
+            bits.golomb()
+        bits.golomb(), bits.golomb()
+        self._streams[name] = bits.golomb() + 4, planes
+
+
+def _units(packet: bytes) -> Iterator[bytes]:
+    """Yield the beginnings of the units of a packet, without start codes."""
+    for code in re.finditer(b"\0\0\1", packet):
+        unit = packet[code.end() : code.end() + _HEADER_BYTES]
+        if len(unit) > 2:
+            yield unit.split(b"\0\0\1")[0]
+
+
+def _numbers_by_order(found: list[int], orders: dict[int, _Order]) -> Int64:
+    """Number decoded pictures [N] (numbers of packets) from 0 as they were taken, lost ones among them.
+
+    Without orders the packets are counted. Sequences of one length that end up to three pictures early lost
+    these.
+    """
+    by_packets: Int64 = np.sort(np.array(found, np.int64)) - min(found)
+    if not set(found) <= set(orders):
+        return by_packets
+    sequences: dict[int, list[int]] = {}
+    for each in orders.values():
+        sequences.setdefault(each.sequence, [] if each.is_whole else [0]).append(each.place)
+    steps = [step for counts in sequences.values() for step in np.diff(np.unique(counts)).tolist()]
+    step = max(set(steps), key=steps.count) if steps else 1
+    lengths = [round((max(counts) - min(counts)) / step) + 1 for counts in sequences.values()]
+    usual = max(set(lengths), key=lengths.count)
+    if 2 * lengths.count(usual) > len(lengths) - 1:
+        lengths = [usual if usual - _MOST_LOST <= length < usual else length for length in lengths]
+    begins = np.cumsum([0, *lengths])
+    taken = [
+        int(begins[order.sequence]) + round((order.place - min(sequences[order.sequence])) / step)
+        for order in map(orders.__getitem__, found)
+    ]
+    count = np.arange(len(taken))
+    # A decoder that misses a key frame mixes the pictures around it.
+    numbers: Int64 = np.maximum.accumulate(np.sort(np.array(taken, np.int64)) - count) + count
+    numbers -= numbers[0]
+    # More pictures lost than given are rather damaged headers.
+    return numbers if numbers[-1] < 2 * len(found) + _NEAR else by_packets
 
 
 # --- decoding -----------------------------------------------------------------------------------------
@@ -507,7 +752,7 @@ def _numbered(
     container: InputContainer, stream: VideoStream, scan: _Scan, *, sought: bool
 ) -> Iterator[tuple[int, VideoFrame]]:
     """Yield numbers and frames in the order of showing; undecodable frames are skipped."""
-    if scan.is_raw:
+    if scan.in_order:
         yield from zip(range(len(scan.ticks)), _decoded(container, stream, None), strict=False)
         return
     last = -1

@@ -281,15 +281,32 @@ def test_raw_streams_are_numbered_and_have_no_times(
     assert READER.describe(path)["frames"] == 30
 
 
-def test_a_picture_that_a_raw_stream_lost_keeps_its_time(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "v.h264", even_ticks(40), b_frames=0, container_format="h264")
-    position, size = packets(path)[25]
-    content = bytearray(path.read_bytes())
-    content[position + 6 : position + size] = b"\x55" * (size - 6)
+@pytest.mark.parametrize(
+    ("form", "b_frames", "lost", "left"),
+    [
+        ("h264", 0, {25: b"\x55"}, 39),
+        ("h264", 0, {13: b"", 23: b""}, 38),
+        ("h264", 2, {7: b"", 29: b""}, 38),
+        ("hevc", 0, {20: b""}, 36),
+    ],
+)
+def test_pictures_that_a_raw_stream_lost_move_no_other(
+    tmp_path: Path, form: str, b_frames: int, lost: dict[int, bytes], left: int
+) -> None:
+    """Picture 36 is a key frame, so what is shown from there on is whole."""
+    path, codec = tmp_path / f"v.{form}", {"h264": "libx264", "hevc": "libx265"}[form]
+    write_video(path, even_ticks(40), codec=codec, b_frames=b_frames, container_format=form)
+    content, places = path.read_bytes(), packets(path)
+    for number, filling in sorted(lost.items(), reverse=True):
+        first, end = places[number][0] + (6 if filling else 0), sum(places[number])
+        content = content[:first] + filling * (end - first) + content[end:]
     path.write_bytes(content)
-    index = READER.index(path)
-    assert list(index.dropped.values()) == [1]
-    assert (index.pts_ns // 10**9).tolist() == [*range(25), *range(26, 40)]
+    with VideoReader(path) as reader:
+        assert reader.index.count + sum(reader.index.dropped.values()) == 40
+        shown = [read_bar_code(picture) for _, picture in reader.frames()]
+    t_s = (reader.index.pts_ns // 10**9).tolist()
+    assert t_s[-4:] == shown[-4:] == [36, 37, 38, 39]
+    assert len(t_s) == left
 
 
 def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
