@@ -239,3 +239,24 @@ def longest_step_ns(t_ns: Int64) -> int:
     """Return the longest step between samples that is not a gap; 0 for fewer than two samples."""
     steps = np.diff(t_ns)
     return int(GAP_IN_USUAL_STEPS * np.percentile(steps, PERCENTILE_OF_USUAL_STEPS)) if len(steps) else 0
+
+
+# Caliscope's files are named by the tracker, which numbers the points of the body so.
+_TRACKERS_OF_CALISCOPE = {
+    "halpe26": "halpe26",
+    "wholebody": "coco23",
+    "holistic": "blazepose33",
+    "xyz_pose": "blazepose33",
+    "xy_pose": "blazepose33",
+}
+
+
+def points_of_caliscope(path: Path) -> dict[str, str]:
+    """Return the names of points by their numbers, which depend on the tracker in the file's name."""
+    tracker = path.stem.lower()
+    skeleton = next((name for word, name in _TRACKERS_OF_CALISCOPE.items() if word in tracker), None)
+    if skeleton is None:
+        problem = "numbers its points, and its name tells no tracker whose numbers are known"
+        raise DataError(path, problem, f"name {path.stem}_labelled.csv beside it", code="no-such-name")
+    names = {str(number): joint for number, joint in enumerate(SKELETONS[skeleton].joints)}
+    return names | ({"100": "right_wrist", "200": "left_wrist"} if "simple" in tracker else {})

@@ -1,4 +1,4 @@
-"""Keypoints as OpenPose, AlphaPose, COCO, MMPose, EasyMocap, Ultralytics, DeepLabCut and SLEAP write them.
+"""Keypoints of OpenPose, AlphaPose, COCO, MMPose, EasyMocap, Ultralytics, DeepLabCut, SLEAP and caliscope.
 
 Each format is a line of a table: how its content is recognised, and how its people are gathered.
 """
@@ -24,7 +24,7 @@ from pipelines.formats.keypoint_files.keypoint_people import (
 )
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.people import SKELETONS
+from pipelines.session.people import SKELETONS, points_of_caliscope
 from pipelines.session.storage import damaged, read_text
 
 # --- OpenPose, and AlphaPose's formats `open` and `cmu` with a file for each picture -----------------------
@@ -370,6 +370,37 @@ def _gather_sleap(people: Gathering) -> None:
         people.add_named(frame, names, found, str(people.path), own_id=own_id)
 
 
+# --- caliscope: a row for each point in a picture ------------------------------------------------------
+
+_CALISCOPE = {"sync_index", "frame_index", "point_id", "img_loc_x", "img_loc_y"}
+
+
+def _is_caliscope(head: object) -> bool:
+    return {*str(head).partition("\n")[0].strip().split(",")} >= _CALISCOPE
+
+
+def _gather_caliscope(people: Gathering) -> None:
+    """Add the person of each picture by `frame_index`; `port`, later `cam_id`, must be one camera."""
+    path, names = people.path, points_of_caliscope(people.path)
+    people.joint_names = tuple(dict.fromkeys(names.values()))
+    rows = [row for row in csv.DictReader(read_text(path).splitlines()) if any(row.values())]
+    cameras = sorted({str(row.get("cam_id", row.get("port"))) for row in rows})
+    if len(cameras) > 1:
+        problem = f"holds keypoints of {len(cameras)} cameras ({', '.join(cameras)[:60]})"
+        raise DataError(path, problem, "write the rows of each camera to a file of its own", code="ambiguous")
+    pictures: dict[int, dict[str, list[float]]] = {}
+    for row in rows:
+        try:
+            xy = [float(row[f"img_loc_{axis}"] or "nan") for axis in "xy"]
+        except (TypeError, ValueError) as error:
+            raise damaged(path, f"has a row that is no point: {str(row)[:60]}") from error
+        if name := names.get(str(row["point_id"]).removesuffix(".0")):
+            frame = people.frame_of(str(row["frame_index"]).removesuffix(".0"), str(path))
+            pictures.setdefault(frame, {})[name] = [*xy, 1.0]
+    for frame, found in pictures.items():
+        people.add_named(frame, [*found], np.array([*found.values()]), str(path))
+
+
 OPENPOSE = KeypointFile("openpose", "OpenPose keypoints", _is_frame, _gather_openpose)
 ALPHAPOSE = KeypointFile(
     "alphapose", "AlphaPose keypoints", _is_alphapose, _gather_alphapose, of_folders=False
@@ -380,3 +411,6 @@ EASYMOCAP = KeypointFile("easymocap_keypoints", "EasyMocap keypoints", _is_easym
 ULTRALYTICS = KeypointFile("ultralytics", "Ultralytics keypoints", _is_ultralytics, _gather_ultralytics)
 DEEPLABCUT = KeypointFile("deeplabcut", "DeepLabCut keypoints", _is_deeplabcut, _gather_deeplabcut, (".csv",))
 SLEAP = KeypointFile("sleap", "SLEAP keypoints", _is_sleap, _gather_sleap, (".csv",))
+CALISCOPE = KeypointFile(
+    "caliscope_keypoints", "caliscope keypoints", _is_caliscope, _gather_caliscope, (".csv",)
+)

@@ -36,7 +36,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64, nearest_rows
 from pipelines.geometry.joint_angles import ANGLES
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
-from pipelines.session.people import SKELETONS, joint_called
+from pipelines.session.people import SKELETONS, joint_called, points_of_caliscope
 from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
 from pipelines.session.storage import damaged, read_text
@@ -239,13 +239,6 @@ _FRAME_NAMES = ("sync_index", "frame")
 # Tables of all points of FreeMoCap and of caliscope have these columns.
 _FREEMOCAP = {"frame", "model", "keypoint", "x", "y", "z"}
 _CALISCOPE = {"sync_index", "point_id", "x_coord", "y_coord", "z_coord"}
-# Caliscope's files are named by the tracker, which numbers the points of the body so.
-_TRACKERS_OF_CALISCOPE = {
-    "halpe26": "halpe26",
-    "wholebody": "coco23",
-    "holistic": "blazepose33",
-    "xyz_pose": "blazepose33",
-}
 
 
 @dataclass(frozen=True)
@@ -352,7 +345,7 @@ def _read_long(path: Path, text: str, unit: str | None, axes: str) -> JointMotio
     units = dict(headings)
     unit = unit or metric_unit(units.get("x_coord") or units.get("x") or "")
     if _columns(text) >= _CALISCOPE:
-        table["keypoint"] = table["point_id"].map(_points_of_caliscope(path))
+        table["keypoint"] = table["point_id"].map(points_of_caliscope(path))
         table = table[table["keypoint"].notna()]
         columns, unit = ["sync_index", "x_coord", "y_coord", "z_coord"], unit or "m"
     else:
@@ -368,17 +361,6 @@ def _read_long(path: Path, text: str, unit: str | None, axes: str) -> JointMotio
     names = pa.chunked_array([table["keypoint"].tolist()])
     motion = _dense(path, t_ns, np.zeros(len(t_ns), np.int64), names, position)
     return replace(motion, joints=joint_names(motion.joints), timed=False)
-
-
-def _points_of_caliscope(path: Path) -> dict[str, str]:
-    """Return the names of points by their numbers, which depend on the tracker in the file's name."""
-    tracker = path.stem.lower()
-    skeleton = next((name for word, name in _TRACKERS_OF_CALISCOPE.items() if word in tracker), None)
-    if skeleton is None:
-        problem = "numbers its points, and its name tells no tracker whose numbers are known"
-        raise DataError(path, problem, f"name {path.stem}_labelled.csv beside it", code="no-such-name")
-    names = {str(number): joint for number, joint in enumerate(SKELETONS[skeleton].joints)}
-    return names | ({"100": "right_wrist", "200": "left_wrist"} if "simple" in tracker else {})
 
 
 def _find_heading(text: str) -> Heading | None:

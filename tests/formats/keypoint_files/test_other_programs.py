@@ -136,3 +136,19 @@ def test_sleap(tmp_path: Path) -> None:
     assert (found.frame.tolist(), found.person.tolist()) == ([4, 4, 5], [0, 1, 0])
     assert at(found, 2, "left_hip") == [8, 2, 0.25]
     assert np.isnan(found.xy[:, found.joints.index("left_shoulder")]).all()
+
+
+def test_caliscope_of_one_camera(tmp_path: Path) -> None:
+    """The first picture lacks points, and no table says of which camera its rows are but `port`."""
+    path, head = (
+        tmp_path / "xy_HALPE26.csv",
+        "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y",
+    )
+    rows = [f"{k + 3},2,{k},,{j},{j + 10 * k},{j},," for k in range(3) for j in range(0 if k else 9, 26)]
+    path.write_text("\n".join([head + ",obj_loc_x,obj_loc_y", *rows]))
+    found = read(path, "caliscope_keypoints")
+    assert (found.joints, found.frame.tolist()) == (get_skeleton("halpe26").joints, [0, 1, 2])
+    assert at(found, 2, "right_shoulder") == [26, 6, 1]
+    path.write_text(path.read_text().replace("\n4,2,", "\n4,1,"))
+    with refused("ambiguous", path):
+        read(path, "caliscope_keypoints")
