@@ -46,8 +46,8 @@ _INDEPENDENT_S = 2.0
 _ALIKE_IN_A_GROUP = 0.85
 # More moments hardly make the shape surer, because offsets of landmarks stay.
 _MOST_MOMENTS = 200
-# Poses of so many moments at once take 100 MB.
-_BLOCK = 256
+# Poses of so many moments at once take 50 MB.
+_BLOCK = 128
 _SHAPE_STEPS, _POSE_STEPS = 12, 6
 # A landmark this many standard deviations off has half its weight.
 _CAUCHY = 3.0

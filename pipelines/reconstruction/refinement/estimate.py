@@ -123,6 +123,7 @@ def learn(
                 problem, known, state, rounds=1, bounds=(BOUND,), most_growth=_MOST_GROWTH
             )
         known = reestimated(system, state, at, poses=poses, motion=known.memory < REMEMBERED)
+        del at  # as in `solve`
         if memory and index == rounds // 2:
             tau = memory_of(system, state)
             if tau > REMEMBERED:

@@ -475,6 +475,7 @@ def _with_constant_levels(
     for _ in range(_LEVEL_ROUNDS):
         system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
         variance = np.diagonal(shared_covariance(system, at))
+        del at  # factors of two estimates would be in memory together
         found: dict[int, list[tuple[float, float]]] = {}
         for (camera, process), (at_knots, column) in zip(
             system.layout.processes, system.layout.place, strict=True
