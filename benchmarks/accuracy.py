@@ -41,7 +41,7 @@ from pipelines.detect import detect, follow
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
 from pipelines.geometry.metrics import measure
-from pipelines.reconstruct import ReconstructSettings, reconstruct
+from pipelines.reconstruct import RECONSTRUCT, ReconstructSettings, reconstruct
 from pipelines.reconstruction.clocks import FoundClocks
 from pipelines.reconstruction.refining import RobustFlight, find_clocks
 from pipelines.session.description import Doubt
@@ -65,6 +65,21 @@ METHODS: dict[str, dict[str, Any]] = {
     "both": {"method": "refined", "refine_cameras": "background"},
     "auto": {"method": "auto"},
 }
+SPECIAL: dict[str, tuple[str, Any]] = {
+    "background": ("reconstruction.background._MOST_UNBOUND", -1.0),
+    "ground": ("reconstruction.ground._FEWEST_PATCHES", 10**9),
+    "rotation levels in the ground": ("reconstruction.ground._rotation_level", lambda *_: np.inf),
+    "cameras that stand": ("reconstruction.background._FEWEST_STANDING", 10**9),
+    "joints without slow errors": ("reconstruction.refinement.refine.REMEMBERED", np.inf),
+    "faster motion": ("reconstruction.refinement.refine._FAST_MOTION", 1.0),
+    "place as logged": ("reconstruction.refinement.refine._position_undetermined", lambda *_: False),
+    "swaps over time": ("reconstruct._without_swaps", lambda cameras, _: (cameras, {})),
+    "swaps between views": (
+        "reconstruct.swaps_across_views",
+        lambda xy, *_: (np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2])), {}),
+    ),
+}
+"""What `auto` can leave out, and what does that: a name in pipelines, and its other value."""
 ALWAYS = ("auto", "robust")
 """Methods that are measured on all draws; the first finds the clocks, and its time is taken."""
 GIVEN: tuple[Given, ...] = ("model", "nothing")
@@ -109,7 +124,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flights", nargs="+", default=["all"], help="tuning, kept, all, or names")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="on all draws (default: auto robust)")
     parser.add_argument(
-        "--parts", action="store_true", help="also what `auto` consists of, on the first draw"
+        "--special", action="store_true", help="also `auto` without each of its special cases"
     )
     parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[0])
     parser.add_argument("--draws", type=int, default=8)
@@ -120,16 +135,16 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
     """Measure, print a line for each flight, and yield the tables of the page."""
     chosen = chosen_flights(options.flights, options.detector)
     methods = options.methods or list(ALWAYS)
-    parts = list(METHODS) if options.parts else []
-    found = measured(chosen, methods, parts, options.detector, options.draws, options.processes)
+    if options.special:
+        found = measured(chosen, ["auto", *SPECIAL], options.detector, options.draws, options.processes)
+        yield "corpus-special", special_table(chosen, found)
+        return
+    found = measured(chosen, methods, options.detector, options.draws, options.processes)
     for said in GIVEN:
         print(f"\nPose noise, {said} given: MPJPE / root-relative mm")
         print("\n".join(flights_table(chosen, methods, said, found)))
         yield f"corpus-{said}", summary(chosen, methods, said, found)
     yield "angles", angles_table(chosen, found)
-    if parts:
-        first = {case: outcome for case, outcome in found.items() if not case.draw}
-        yield "corpus-parts", summary(chosen, parts, "model", first)
 
 
 def chosen_flights(names: Sequence[str], detector: str) -> list[Flight]:
@@ -154,24 +169,19 @@ def chosen_flights(names: Sequence[str], detector: str) -> list[Flight]:
 def measured(
     chosen: Sequence[Flight],
     methods: Sequence[str],
-    parts: Sequence[str],
     detector: str,
     draws: int,
     processes: int,
 ) -> dict[Case, Outcome]:
-    """Measure every flight, draw and method, and the parts on the first draw with the model given.
-
-    What is kept of earlier runs of the same code is taken.
-    """
+    """Measure every flight, draw and method; what is kept of earlier runs of the same code is taken."""
     work = [
         [
             [Case(flight.name, FLOOR, detector)],
             *([Case(flight.name, SHARED, detector, "model", draw)] for draw in range(draws)),
             *(
-                [Case(flight.name, method, detector, said, draw) for method in dict.fromkeys(names)]
+                [Case(flight.name, method, detector, said, draw) for method in methods]
                 for draw in range(draws)
                 for said in GIVEN
-                for names in [[*methods, *(parts if (said, draw) == ("model", 0) else ())]]
             ),
         ]
         for flight in sorted(chosen, key=_effort, reverse=True)
@@ -269,11 +279,13 @@ def measure_draw(
                     follow(writable)
             for case in cases:
                 timed = case is first and not case.draw
-                method = METHODS["robust" if case.method in _POSES else case.method]
+                name, value = SPECIAL.get(case.method, ("reconstruct.RECONSTRUCT", RECONSTRUCT))
+                method = METHODS.get(case.method, METHODS["robust" if case.method in _POSES else "auto"])
                 settings = ReconstructSettings(**method, people=1, detector=first.detector)
                 began_s = time.process_time()
                 try:
-                    with nullcontext() if timed else patch("pipelines.reconstruct.doubts_of", _no_doubts):
+                    quick = nullcontext() if timed else patch("pipelines.reconstruct.doubts_of", _no_doubts)
+                    with quick, patch(f"pipelines.{name}", value):
                         reconstruct(session, settings)
                 except DataError as error:
                     yield case, Outcome(error=str(error))
@@ -390,6 +402,34 @@ def summary(
             rows[-1].insert(3, fixed(float(np.nanmax(ratios)), 2))
     header = ["half", "method", "MPJPE", "largest ratio to robust", "root-relative", "acceleration m/s^2"]
     return markdown_table([*header, "NEES", "in 95 % %", "measured %"], rows)
+
+
+def special_table(chosen: Sequence[Flight], found: Mapping[Case, Outcome]) -> list[str]:
+    """Write a line for each special case: what `auto` loses without it, and the flight that it helps most."""
+    rows = []
+    for case in SPECIAL:
+        rows.append([case])
+        for given in GIVEN:
+            both = {f.name: [_of(f, method, given, found) for method in (case, "auto")] for f in chosen}
+            for figure in ("mpjpe_mm", "root_mpjpe_mm"):
+                change = {
+                    name: 100 * (_mean(without, figure) / _mean(whole, figure) - 1)
+                    for name, (without, whole) in both.items()
+                }
+                most = max(change, key=lambda name: change[name])
+                rows[-1].append(f"{np.mean(list(change.values())):+.1f} ({change[most]:+.1f} {most})")
+            rows[-1].append(
+                " / ".join(
+                    fixed(float(np.mean([_mean(each[k], "nees") for each in both.values()])), 1)
+                    for k in (0, 1)
+                )
+            )
+    names = [
+        f"{said}: {figure}"
+        for said in ("stated", "not stated")
+        for figure in ("MPJPE %", "root-relative %", "NEES")
+    ]
+    return markdown_table(["`auto` without", *names], rows)
 
 
 _COLUMNS = (

@@ -62,7 +62,7 @@ SECTIONS = (
             Part("sample-poses", "The sample flight", RENDERED, TUNED),
             Part("corpus-model", "The corpus, pose noise stated", RENDERED, "each half by its name"),
             Part("corpus-nothing", "The corpus, pose noise not stated", RENDERED, "each half by its name"),
-            Part("corpus-parts", "What each part of `auto` adds, one draw", RENDERED, "both halves"),
+            Part("corpus-special", "`auto` without each of its special cases", RENDERED, "kept aside"),
             Part("angles", "Joint angles", RENDERED, KEPT),
             Part("bodies", "Bodies with a surface, one draw, noise stated", RENDERED, KEPT),
         ),
