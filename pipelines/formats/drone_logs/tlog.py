@@ -252,10 +252,13 @@ class _Packets:
         rows = list(kind.unpacker.iter_unpack(bytes(self.payloads.get((system, message), b""))))
         columns = zip(*rows, strict=True) if rows else ((),) * len(names)
         found = {name: np.array(column) for name, column in zip(names, columns, strict=True)}
-        if rows and "time_boot_ms" in found and self.boots(system).places.size:
-            boot_ns = found["time_boot_ms"].astype(np.int64) * 1_000_000
-            stamps_us = np.array(self.stamps_us[system, message], dtype=np.int64)
-            found["time_boot_ms"] = self.boots(system).going_on(boot_ns, stamps_us) // 1_000_000
+        for name, unit_ns in (("time_boot_ms", 1_000_000), ("time_usec", 1000)):
+            if rows and name in found and self.boots(system).places.size:
+                stamps_us = np.array(self.stamps_us[system, message], dtype=np.int64)
+                stated = found[name].astype(np.int64)
+                going_on = self.boots(system).going_on(stated * unit_ns, stamps_us) // unit_ns
+                # Times in UTC go on by themselves.
+                found[name] = np.where((stated >= 0) & (stated < _UNIX_US), going_on, stated)
         return found
 
     def boots(self, system: int) -> Boots:

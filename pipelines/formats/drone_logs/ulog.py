@@ -77,8 +77,8 @@ class UlogFormat(DroneLog):
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position (local if ever valid, else global, else GPS's), attitude and gimbal."""
-        topics = read_topics(path, _WANTED)
         notes: list[str] = []
+        topics = read_topics(path, _WANTED, notes)
         fit = on_gps_time(path, _gps_time(topics), choice.time, notes)
         return telemetry_of(path, topics, choice, fit, notes)
 
@@ -305,8 +305,8 @@ class UlogTopic:
         return np.where(sampled > 0, sampled, published) * 1000
 
 
-def read_topics(path: Path, wanted: Collection[str]) -> list[UlogTopic]:
-    """Read the topics of some names that have a stamp, sorted by name and instance."""
+def read_topics(path: Path, wanted: Collection[str], notes: list[str] | None = None) -> list[UlogTopic]:
+    """Read the topics of some names that have a stamp, sorted by name and instance; note what is missing."""
     core = need("pyulog", "drones")
     _refuse_bombs(path)
     try:
@@ -314,6 +314,13 @@ def read_topics(path: Path, wanted: Collection[str]) -> list[UlogTopic]:
             log = core.ULog(file, sorted(wanted))
     except Exception as error:  # damaged files raise many kinds of errors in this parser
         raise damaged(path, error) from error
+    if notes is not None and log.file_corruption:
+        notes.append("is damaged: messages are missing, at most all after the first damage")
+    if notes is not None and log.dropouts:
+        missing_s = sum(dropout.duration for dropout in log.dropouts) / 1e3
+        notes.append(
+            f"its recorder lost messages {len(log.dropouts)} times, over {missing_s:.2f} s (dropouts)"
+        )
     found = [UlogTopic(str(d.name), int(d.multi_id), d.data) for d in log.data_list if "timestamp" in d.data]
     return sorted(found, key=lambda topic: (topic.name, topic.instance))
 

@@ -79,8 +79,9 @@ def test_without_gps_time_the_station_s_clock_counts(tmp_path: Path, truth: Dron
         read(path, time="gps")
 
 
+@pytest.mark.parametrize("position", ["global", "gps"])
 def test_a_restart_of_the_vehicle_is_told_and_its_times_go_on(
-    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch, position: str
 ) -> None:
     half = len(truth.boot_us) // 2
     boot_us = truth.boot_us.copy()
@@ -88,7 +89,7 @@ def test_a_restart_of_the_vehicle_is_told_and_its_times_go_on(
     monkeypatch.setattr(DroneTruth, "boot_us", boot_us)
     path = write_tlog(tmp_path / "a.tlog", truth, gps_time=False)
     monkeypatch.undo()
-    telemetry = read(path)
+    telemetry = read(path, position=position)
     late_ns = telemetry.position.t_ns - truth.t_ns
     assert np.abs(late_ns - 4_000_000_000).max() < 2_500_000  # the station's clock, and whole ms since boot
     assert len([note for note in telemetry.notes if "restarted 1 times" in note]) == 1
