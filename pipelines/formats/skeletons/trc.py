@@ -88,10 +88,10 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
             continue
         cells = (line.replace(",", ".") if decimal_commas else line).split("\t")
         last = number == first_line + len(lines) - 1  # without its end of line: perhaps broken off
+        while len(cells) % 3 != 2 and not cells[-1].strip():
+            cells.pop()  # many writers end their lines with a tab
         if 2 < len(cells) < 3 * markers + 2 and len(cells) % 3 == 2 and not last:
             cells += [""] * (3 * markers + 2 - len(cells))  # some programs cut blanks at the end of a line
-        if len(cells) == 3 * markers + 3 and not cells[-1].strip():
-            cells.pop()  # many writers end their lines with a tab
         if len(cells) != 3 * markers + 2:
             raise bad_value(path, f"line {number} has {len(cells)} cells instead of {3 * markers + 2}")
         try:
