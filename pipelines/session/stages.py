@@ -255,7 +255,8 @@ class Session:
         for path in self._changed(record):
             problem = f"is not what `{command}` wrote (other SHA-256): it was changed since"
             if not path.is_file():
-                problem = f"is gone although `{command}` wrote it"
+                kept = "no file any more" if path.exists() else "gone"
+                problem = f"is {kept} although `{command}` wrote it"
             raise DataError(path, problem, f"run `{command}` again, which makes it anew", code="changed")
         return record
 

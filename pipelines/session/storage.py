@@ -34,7 +34,7 @@ _REMEDIES = {
     errno.EDQUOT: "free some space and run the command again",
     errno.EACCES: "check its permissions, or choose another place with --output",
     errno.EPERM: "check its permissions, or choose another place with --output",
-    errno.EROFS: "choose another place with --output",
+    errno.EROFS: "choose another place with --output, or copy it to where files can be written",
 }
 
 _CODES = {
