@@ -14,5 +14,5 @@ def _without_diagnosis_and_figures(request: pytest.FixtureRequest) -> Iterator[N
     with pytest.MonkeyPatch.context() as patch:
         if not getattr(request.module, "WHOLE", False):
             patch.setattr("pipelines.reconstruct.doubts_of", lambda *_, **__: [])
-            patch.setattr("pipelines.reporting.chart._inline_svg", lambda _: "<svg></svg>")
+            patch.setattr("pipelines.reporting.chart._inline_svg", lambda *_: "<svg></svg>")
         yield
