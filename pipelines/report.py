@@ -14,7 +14,7 @@ import pyarrow as pa
 from pipelines.geometry.arrays import Int64, Picture, nearest_rows
 from pipelines.reporting.chart import MARK, refuse_foreign, write_figures
 from pipelines.reporting.content import ReplanContent, SessionContent, StudyContent, estimated_clocks, section
-from pipelines.reporting.page import draw_session, render_page
+from pipelines.reporting.page import draw_page, draw_session
 from pipelines.reporting.pictures import Video
 from pipelines.reporting.session_comparison import compare, draw_comparison, labels_of, render_comparison
 from pipelines.reporting.studies import draw_study, study_blocks
@@ -145,9 +145,13 @@ class _Page:
         folder = self.session.folder
         with ExitStack() as stack:
             pictures, warnings = _open_pictures(folder, self._description, stack)
-            content = replace(_load(folder, self._description, self._records), studies=self._studied)
-            html = render_page(content, read_frame=partial(_read_frame, pictures), video=self._video)
-        return html, warnings
+            page = draw_page(
+                replace(_load(folder, self._description, self._records), studies=self._studied),
+                read_frame=partial(_read_frame, pictures),
+                video=self._video,
+            )
+        return_unused()  # the tables, before the text of the page takes as much
+        return page.render(), warnings
 
 
 def compare_sessions(
@@ -321,6 +325,8 @@ def content_of(folder: Path) -> SessionContent:
 # A page is drawn from 4500 times of one person with 33 joints, or as much of others: more change no
 # figure, and take memory.
 MAX_ROWS = 150_000
+# Arms are drawn from two minutes at 50 Hz, or as many times of a longer flight.
+MAX_ARM_TIMES = 6_000
 
 
 class _Shown:
@@ -422,17 +428,24 @@ def _by_camera(shown: _Shown, name: str, record: StageRecord | None) -> dict[str
     return {str(name): own[POSES.names].reset_index(drop=True) for name, own in table.groupby("camera")}
 
 
+def _thinned(path: Path, schema: pa.Schema) -> pd.DataFrame:
+    """Read a table of a comparison, of a long one every k-th time."""
+    stamps = distinct(path, "t_ns")
+    every = max(-(-len(stamps) // MAX_ARM_TIMES), 1)
+    return read_table(path, schema) if every == 1 else _rows(path, schema, "t_ns", stamps[::every])
+
+
 def _load_replan(folder: Path, records: dict[str, StageRecord], maps: list[Occupancy]) -> ReplanContent:
     place, record = folder / "replan", records["replan"]
     metrics = read_json(place / "metrics.json")
     return ReplanContent(
         metrics=metrics,
         arms={
-            arm: read_table(place / arm / "trajectories.parquet", REPLAN)
+            arm: _thinned(place / arm / "trajectories.parquet", REPLAN)
             for arm in section(metrics, "arms")
             if f"replan/{arm}/trajectories.parquet" in record.outputs
         },
-        actor=read_table(place / "actor.parquet", ACTOR),
+        actor=_thinned(place / "actor.parquet", ACTOR),
         map=max(maps, key=lambda one: one.from_ns, default=None),
         filmed=read_json(folder / "film" / "metrics.json") if "film" in records else {},
     )

@@ -36,8 +36,8 @@ def _template(name: str, **context: object) -> Markup:
     return Markup(environment().get_template(name).render(**context))  # noqa: S704 - escaped by the template
 
 
-def render_page(content: SessionContent, read_frame: ReadFrame | None = None, video: Video = "none") -> str:
-    """Render the complete HTML of a session's report, its overlays on the pictures of `read_frame`."""
+def draw_page(content: SessionContent, read_frame: ReadFrame | None = None, video: Video = "none") -> Page:
+    """Draw a session's report, without its tables in it; the overlays are on pictures of `read_frame`."""
     summary = summarise(content)
     replan = _replan(summary, content)
     figures = {figure.key: figure for figure in _draw(summary, content, replan)}
@@ -98,7 +98,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None, vi
         footer="World axes east, north, up in metres; pixels count from the centre of the top left one.",
         scene=scene,
         pictures=bool(strips) or overlays is not None,
-    ).render()
+    )
 
 
 def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -> list[Figure]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.reporting.content import SessionContent
-from pipelines.reporting.page import render_page
+from pipelines.reporting.page import draw_page
 
 from .browser import Browser, browser
 from .comparisons import make_comparison
@@ -47,7 +47,7 @@ def page(content: SessionContent, tmp_path_factory: pytest.TempPathFactory) -> P
     """Render the report with pictures behind the overlays, as a file."""
     path = tmp_path_factory.mktemp("report") / "index.html"
     picture = np.full((1080, 1920, 3), 90, dtype=np.uint8)
-    path.write_text(render_page(content, lambda _camera, _frame: picture), encoding="utf-8")
+    path.write_text(draw_page(content, lambda _camera, _frame: picture).render(), encoding="utf-8")
     return path
 
 
@@ -159,7 +159,7 @@ def test_arms_and_the_map_are_shown_as_chosen(
     chromium: Browser, content: SessionContent, tmp_path: Path
 ) -> None:
     path = tmp_path / "index.html"
-    path.write_text(render_page(replace(content, replan=make_comparison())), encoding="utf-8")
+    path.write_text(draw_page(replace(content, replan=make_comparison())).render(), encoding="utf-8")
     chromium.complaints.clear()
     chromium.show_as(scheme="dark")
     chromium.open(path)

@@ -23,7 +23,7 @@ from pipelines.reporting import chart
 from pipelines.reporting.chart import MARK, Figure, refuse_foreign, write_figures
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.overlays import MOMENTS
-from pipelines.reporting.page import draw_session, render_page
+from pipelines.reporting.page import draw_page, draw_session
 from pipelines.reporting.viewer import MAX_BYTES
 from pipelines.reporting.wording import joint_label
 from pipelines.session.errors import DataError
@@ -56,7 +56,7 @@ def _sentences(outline: Outline, word: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def page(content: SessionContent) -> str:
-    return render_page(content)
+    return draw_page(content).render()
 
 
 def test_page_is_whole_and_small(page: str) -> None:
@@ -99,7 +99,7 @@ def test_pictures_are_held_by_the_page(content: SessionContent, page: str) -> No
         asked.append((camera, frame))
         return None if camera == "mast" else np.full((1080, 1920, 3), 90, dtype=np.uint8)
 
-    filmed = render_page(content, read_frame)
+    filmed = draw_page(content, read_frame).render()
     outline = Outline(filmed)
     pictures = [link for link in outline.links if not link.startswith(("#", "data:text/csv;"))]
     assert all(link.startswith("data:image/webp;base64,") for link in pictures)
@@ -126,7 +126,7 @@ def test_numbers_of_the_page_are_those_of_the_data(page: str) -> None:
 
 def test_page_before_the_reconstruction(content: SessionContent) -> None:
     ingested = replace(content, skeleton=None, metrics=None, truth=None, stages={})
-    outline = Outline(render_page(ingested))
+    outline = Outline(draw_page(ingested).render())
     assert "MPJPE" not in outline.text
     assert outline.count("figure") == 3
     assert outline.count("canvas") == 1  # the cameras alone
@@ -139,7 +139,7 @@ def test_page_of_unknown_joints_and_two_people(content: SessionContent) -> None:
     both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
     figures = {"coverage": 0.905, "reconstructed_share": 0.8, "mpjpe_mm": 43.21}
     by_person = {"person0": figures, "person1": figures | {"mpjpe_mm": None}}
-    page = render_page(replace(content, skeleton=both, metrics={"by_person": by_person}, truth=None))
+    page = draw_page(replace(content, skeleton=both, metrics={"by_person": by_person}, truth=None)).render()
     outline = Outline(page)
     assert "90.5" in outline.text
     assert "43.2" in outline.text
@@ -196,12 +196,12 @@ def _named(content: SessionContent, name: str) -> SessionContent:
 
 @pytest.fixture(scope="module")
 def tame(content: SessionContent) -> Outline:
-    return Outline(render_page(_named(content, "tame")))
+    return Outline(draw_page(_named(content, "tame")).render())
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_names_from_files_stay_text(content: SessionContent, tame: Outline, name: str) -> None:
-    page = render_page(_named(content, name))
+    page = draw_page(_named(content, name)).render()
     outline = Outline(page)
     # Not one element or attribute more than with a harmless name; in the figures, where a longer label
     # leaves room for other ticks, none of another kind.
@@ -218,7 +218,7 @@ def test_names_from_files_stay_text(content: SessionContent, tame: Outline, name
 
 @pytest.fixture(scope="module")
 def compared(content: SessionContent) -> str:
-    return render_page(replace(content, replan=make_comparison()))
+    return draw_page(replace(content, replan=make_comparison())).render()
 
 
 def test_a_comparison_of_planners_is_a_tab(page: str, compared: str) -> None:
@@ -246,7 +246,7 @@ def test_long_flight_stays_small_and_says_what_is_left_out(content: SessionConte
         frames=make_frames(frames),
         keypoints=make_keypoints(frames),
     )
-    page = render_page(long_flight)
+    page = draw_page(long_flight).render()
     outline = Outline(page)
     # The motion has at most 6 MB before base64. Pictures add about 1.5 MB to the rest: 6 million pixels at
     # 1.5 bits, in base64. Script and styles are 0.06 MB.
