@@ -513,7 +513,7 @@ class _Order(NamedTuple):
     """Place of a coded picture in the order of showing."""
 
     sequence: int  # from one key frame that refers to nothing before it to the next
-    place: int  # picture order count in the sequence, in steps of one stream
+    place: int | None  # picture order count in the sequence; None if it is not known
     is_whole: bool  # False if the key frame of the sequence is lost
 
 
@@ -546,37 +546,36 @@ _HEADER_BYTES = 1024
 
 
 def _orders(coded: Iterator[Packet[VideoStream]], codec: str, given: set[int]) -> dict[int, _Order]:
-    """Read the place of each coded picture in the order of showing, by number of packet, from its header.
-
-    Empty for other codecs, or if a header cannot be read.
-    """
+    """Read the place of each coded picture in the order of showing, by number of packet, from its header."""
     head = _H264Head() if codec == "h264" else _H265Head() if codec == "hevc" else None
     if head is None:
         return {}
     orders: dict[int, _Order] = {}
     sequence, is_whole, reference = -1, False, 0
     seen: set[int] = set()
-    try:
-        for number, packet in enumerate(coded):
+    for number, packet in enumerate(coded):
+        try:
             found = head.read(bytes(packet))
-            if found is None:
-                continue
-            starts, is_reference, low, modulus = found
-            # The count of least distance to that of the last reference (ITU-T H.264, 8.2.1; H.265, 8.3.1).
-            half = modulus // 2
-            step = (low - reference + half) % modulus - half
-            if not (starts or number in given or abs(step) <= _NEAR < modulus / 4):
-                continue  # a damaged header
-            count = low if starts else reference + step
-            # A count that was there before is that of a sequence whose first picture is lost.
-            if starts or count in seen or sequence < 0:
-                sequence, is_whole, seen = sequence + 1, starts, set()
-                count = low
-            seen.add(count)
-            orders[number] = _Order(sequence, count, is_whole)
-            reference = count if is_reference or starts else reference
-    except (ValueError, KeyError):
-        return {}
+        except (ValueError, KeyError):
+            found = None
+        if found is None or (found.is_field and number not in given):
+            continue
+        # The count of least distance to that of the last reference (ITU-T H.264, 8.2.1; H.265, 8.3.1).
+        half = found.modulus // 2
+        step = (found.place - reference + half) % found.modulus - half
+        if not (found.starts or number in given or abs(step) <= _NEAR < found.modulus / 4):
+            orders[number] = _Order(sequence, None, is_whole)
+            continue
+        count = found.place if found.starts else reference + step
+        if not found.starts and count in seen and step + found.modulus <= 3 * found.modulus // 4:
+            count += found.modulus  # references were lost
+        # A count that was there before is that of a sequence whose first picture is lost.
+        if found.starts or count in seen or sequence < 0:
+            sequence, is_whole, seen = sequence + 1, found.starts, set()
+            count = found.place
+        seen.add(count)
+        orders[number] = _Order(sequence, count, is_whole)
+        reference = count if found.is_reference or found.starts else reference
     return orders
 
 
@@ -587,6 +586,7 @@ class _Coded(NamedTuple):
     is_reference: bool
     place: int  # picture order count, modulo `modulus`
     modulus: int
+    is_field: bool = False
 
 
 class _H264Head:
@@ -609,14 +609,14 @@ class _H264Head:
                 frame_bits, order_bits, planes, fields = self._streams[self._pictures[bits.golomb()]]
                 bits.read(2 * planes)
                 number = bits.read(frame_bits)
-                if fields and bits.read(1):
+                if is_field := bool(fields and bits.read(1)):
                     bits.read(1)
                 if kind == 5:
                     bits.golomb()
                 is_reference = bool(unit[0] & 0x60)
-                if order_bits:
-                    return _Coded(kind == 5, is_reference, bits.read(order_bits), 1 << order_bits)
-                return _Coded(kind == 5, is_reference, 2 * number - (not is_reference), 2 << frame_bits)
+                place = bits.read(order_bits) if order_bits else 2 * number - (not is_reference)
+                modulus = 1 << order_bits if order_bits else 2 << frame_bits
+                return _Coded(kind == 5, is_reference, place, modulus, is_field)
         return None
 
     def _read_stream(self, bits: _Bits) -> None:
@@ -700,21 +700,32 @@ def _numbers_by_order(found: list[int], orders: dict[int, _Order]) -> Int64:
     these.
     """
     by_packets: Int64 = np.sort(np.array(found, np.int64)) - min(found)
-    if not set(found) <= set(orders):
-        return by_packets
     sequences: dict[int, list[int]] = {}
+    unplaced: dict[int, int] = {}  # pictures after the last that is placed
+    first = next((each.place for each in orders.values() if each.is_whole), 0) or 0
     for each in orders.values():
-        sequences.setdefault(each.sequence, [] if each.is_whole else [0]).append(each.place)
+        counts = sequences.setdefault(each.sequence, [] if each.is_whole else [first])
+        if not each.is_whole:  # what was not given before it belongs to it
+            unplaced[each.sequence - 1] = 0
+        unplaced[each.sequence] = unplaced.get(each.sequence, 0) + 1 if each.place is None else 0
+        counts += [] if each.place is None else [each.place]
+    places = [order.place for number in found if (order := orders.get(number))]
+    if len(places) < len(found):
+        return by_packets
     steps = [step for counts in sequences.values() for step in np.diff(np.unique(counts)).tolist()]
     step = max(set(steps), key=steps.count) if steps else 1
-    lengths = [round((max(counts) - min(counts)) / step) + 1 for counts in sequences.values()]
-    usual = max(set(lengths), key=lengths.count)
-    if 2 * lengths.count(usual) > len(lengths) - 1:
-        lengths = [usual if usual - _MOST_LOST <= length < usual else length for length in lengths]
+    lengths = [
+        round((max(counts) - min(counts)) / step) + 1 + unplaced[sequence]
+        for sequence, counts in sequences.items()
+    ]
+    inner, usual = lengths[:-1], max(lengths, default=0)
+    if 2 * lengths.count(usual) > len(inner) > 0 and min(inner) >= usual - _MOST_LOST:
+        lengths = [usual] * len(inner)
     begins = np.cumsum([0, *lengths])
     taken = [
-        int(begins[order.sequence]) + round((order.place - min(sequences[order.sequence])) / step)
-        for order in map(orders.__getitem__, found)
+        int(begins[orders[number].sequence]) + round((place - min(sequences[orders[number].sequence])) / step)
+        for number, place in zip(found, places, strict=True)
+        if place is not None
     ]
     count = np.arange(len(taken))
     # A decoder that misses a key frame mixes the pictures around it.
