@@ -1,7 +1,7 @@
 """Stage `draft`: write a flight.yaml for files and folders; it can be ingested or says what is missing."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,6 +13,7 @@ import numpy as np
 
 from pipelines.drafting.found import (
     ACTOR,
+    GIMBAL,
     LAST_POSE_TYPE,
     NED,
     NO_DATE_NS,
@@ -598,13 +599,23 @@ class _MotionComparison:
             other = match(multiply(attitude, ahead), gimbal, relative_to)
             if other and (best is None or np.nansum(other.gain) > np.nansum(best.gain)):
                 best = other
-        if turning:
+        if turning and all(is_called(gimbal.topic, GIMBAL) for gimbal in gimbals):
             return best
-        own = match(body)
+        fixed = self._without_gimbal(match, found, body)
+        turns = best is not None and (fixed is None or explains_better(best.gain, fixed.gain))
+        return best if turns else fixed
+
+    @staticmethod
+    def _without_gimbal(
+        explain: Callable[[Float], MotionMatch | None], found: Proposal, body: Float
+    ) -> MotionMatch | None:
+        """Return how well a mount that does not turn explains a video."""
+        best: MotionMatch | None = None
+        own = explain(body)
         if isinstance(found, FlownPoses) and not found.of_body:
             return own
         for down_deg in TRIED_DOWN_DEG:
-            other = match(multiply(body, body_from_camera("forward", down_deg)))
+            other = explain(multiply(body, body_from_camera("forward", down_deg)))
             if other and (best is None or explains_better(other.gain, best.gain)):
                 best = replace(other, of_body=True, down_deg=down_deg)
         named, other = (best, own) if found.of_body else (own, best)

@@ -339,11 +339,12 @@ class _ManifestWriter:
         down_deg = camera.motion.down_deg if camera.motion else 0
         tilt = f"{down_deg:g} deg down, as its pictures move" if down_deg else "level"
         remark = self.assume(camera, "mount", f"the camera looks forward, {tilt}, from the body's origin")
+        angles = camera.unnamed_angles
         by_film = "# or, in place of the mount: pose: {..., attitude: pictures}"
         return DraftedKey(
             self.guessed({"looks": "forward", "down_deg": down_deg, "translation": [0, 0, 0]}),
             [remark],
-            [by_film] if camera.film else [],
+            [by_film] * bool(camera.film) + self.others("gimbal", angles.all if angles else ()),
         )
 
     def _intrinsics(self, camera: CameraDraft) -> DraftedKey:

@@ -134,6 +134,7 @@ class CameraDraft:
     pictures: dict[str, list[Proposal]] = field(default_factory=lambda: {"video": [], "keypoints": []})
     paired: bool = False  # video and keypoints are matched only because nothing else is left
     choices: dict[str, Chosen] = field(default_factory=dict)
+    unnamed_angles: Chosen | None = None  # beside its poses, which no name calls those of a gimbal
     gimbal_reference: RelativeTo | None = None  # what its gimbal's angles are relative to
     motion: MotionMatch | None = None  # of its video and poses, where they agree
     likely: dict[int, float] = field(default_factory=dict)  # gain of motion by id of poses
@@ -199,8 +200,9 @@ def match(
     moving = [c for c in poses if not _is_true(c) and not (c.topic and is_called(c.topic, ACTOR | COMMANDED))]
     joints = [c for c in of.get("joints", []) if _is_true(c)]
     joints.sort(key=lambda c: (-_shared([c.span], _spans(moving)), c.place))
-    # Angles of other names are magnetic fields, velocities, attitudes.
-    gimbals = [c for c in of.get("gimbal", []) if is_called(c.topic, GIMBAL)]
+    # Three numbers of other names are magnetic fields and velocities, and quaternions may be attitudes.
+    turning = [c for c in of.get("gimbal", []) if is_called(c.topic, GIMBAL) or "Quaternion" in c.type]
+    gimbals = [c for c in turning if is_called(c.topic, GIMBAL)]
     cameras = _cameras(of, moving)
     anchors = [*moving, *of.get("joints", [])]
 
@@ -220,7 +222,9 @@ def match(
             "gimbal": turned,
         }
         camera.choices = {part: choice for part, choice in found_choices.items() if choice is not None}
-    _pair_by_content(cameras, moving, gimbals, compare)
+        if turned is None and pose and pose.taken.of_body:
+            camera.unnamed_angles = _beside_pose(pose.taken, turning, moving)
+    _pair_by_content(cameras, moving, gimbals, turning, compare)
     _prefer_attitudes(cameras, moving, distance)
     for camera in cameras:
         logged = camera.choices.get("pose")
@@ -387,6 +391,7 @@ def _pair_by_content(
     cameras: Sequence[CameraDraft],
     moving: Sequence[Proposal],
     gimbals: Sequence[Proposal],
+    turning: Sequence[Proposal],
     compare: Compare,
 ) -> None:
     """Give videos without poses those that no camera has, by time, else by motion, which tells the start."""
@@ -404,10 +409,14 @@ def _pair_by_content(
         logs = possible[camera.name]
         if len(logs) == 1 and uses[id(logs[0])] == 1:
             camera.choices["pose"] = Chosen(logs[0], named=False, why="by the times of video and log")
-            if turning := _beside_pose(logs[0], gimbals, moving):
-                camera.choices["gimbal"] = turning
+            if gimbal := _beside_pose(logs[0], gimbals, moving):
+                camera.choices["gimbal"] = gimbal
+            elif logs[0].of_body:
+                camera.unnamed_angles = _beside_pose(logs[0], turning, moving)
             continue
-        turned = [(log, _beside_pose(log, gimbals, moving)) for log in logs]
+        turned = [
+            (log, _beside_pose(log, gimbals, moving) or _beside_pose(log, turning, moving)) for log in logs
+        ]
         compared = [(log, compare(film, log, beside.all if beside else ())) for log, beside in turned]
         known = [(log, alike) for log, alike in compared if alike is not None]
         camera.likely = {id(log): float(np.nansum(alike.gain)) for log, alike in known}
@@ -423,6 +432,8 @@ def _pair_by_content(
             if alike.gimbal is not None:
                 camera.choices["gimbal"] = Chosen(alike.gimbal)
                 camera.gimbal_reference = alike.relative_to
+            elif log.of_body:
+                camera.unnamed_angles = _beside_pose(log, turning, moving)
     for camera in cameras:
         _settle_by_motion(camera, compare)
 
@@ -433,14 +444,16 @@ def _settle_by_motion(camera: CameraDraft, compare: Compare) -> None:
     if film is None or "pose" not in choices or choices["pose"].start_ns is not None:
         return
     pose, gimbal = choices["pose"], choices.get("gimbal")
+    unnamed = camera.unnamed_angles.all if camera.unnamed_angles else ()
     timed = "frame_times" in choices or pose.taken.path == film.path
     if timed and gimbal is None and not pose.taken.of_body:
         return
-    alike = compare(film, pose.taken, [gimbal.taken] if gimbal else [])
+    alike = compare(film, pose.taken, [gimbal.taken] if gimbal else unnamed)
     if alike is None or not explains_better(alike.gain, np.zeros_like(alike.gain)):
         return
     camera.motion = alike
     if alike.gimbal is not None:
+        choices.setdefault("gimbal", Chosen(alike.gimbal))
         camera.gimbal_reference = alike.relative_to
     if not timed:
         choices["pose"] = replace(pose, start_ns=alike.start_ns)

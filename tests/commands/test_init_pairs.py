@@ -21,7 +21,7 @@ from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, matrix_from_quaternion, multiply
 from tests.commands.runner import mocap
 from tests.synthetic.drone_logs import HOME, DroneTruth, angles_of, ulog_rows, write_dataflash, write_ulog
-from tests.synthetic.logged_flights import pose_entry
+from tests.synthetic.logged_flights import attitude_entry, pose_entry
 from tests.synthetic.logs import write_mcap
 from tests.synthetic.videos import even_ticks, write_video
 
@@ -194,3 +194,17 @@ def test_a_film_on_its_logged_places_gives_the_focal_length(tmp_path: Path) -> N
     lens = cameras_of(tmp_path)["left"]["intrinsics"]
     assert lens["fx"] == pytest.approx(640 / np.tan(np.radians(40)), rel=0.05)
     assert "assumed" not in lens
+
+
+def test_angles_of_any_name_are_a_gimbal_where_pictures_turn_by_them(tmp_path: Path) -> None:
+    copied(SAMPLE / "drone1.mp4", tmp_path / "clip.mp4", pictures=180)
+    flown = TUM.read_trajectory(SAMPLE / "truth" / "drone1.tum")
+    turned = multiply(flown.quaternion_xyzw, conjugate(body_from_camera("forward")))
+    entries = []
+    for t_ns, place, angles in zip(
+        flown.t_ns.tolist(), flown.position.tolist(), turned.tolist(), strict=True
+    ):
+        entries += [pose_entry("/alpha/state", t_ns, place), attitude_entry("/alpha/mnt", t_ns, angles)]
+    write_mcap(tmp_path / "rec.mcap", entries)
+    (camera,) = cameras_of(tmp_path).values()
+    assert (camera["gimbal"]["topic"], camera["gimbal"]["relative_to"]) == ("/alpha/mnt", "world")

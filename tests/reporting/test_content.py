@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import (
@@ -21,7 +19,7 @@ from pipelines.reporting.overlays import collect_moments
 from pipelines.reporting.pictures import make_strips
 from pipelines.reporting.summary import Verdict, give_verdict, summarise, truth_at
 from pipelines.reporting.viewer import make_scene
-from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, THIN, cell_text, joint_label, percent
+from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, cell_text, joint_label
 
 from .conftest import ASIDE_PX, CAMERAS, FRAMES, JOINTS, OFFSET_M, STAGES, make_skeleton, make_truth, statuses
 from .reading import numbers, one
@@ -218,11 +216,6 @@ def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
     assert "W1" in sentence
     assert "R1" in sentence
     assert verdict.why[0] == sentence
-
-
-@given(st.floats(0, 1))
-def test_percent_is_never_rounded_to_an_end(share: float) -> None:
-    assert (percent(share) in {f"0{THIN}%", f"100{THIN}%"}) == (share in {0, 1})
 
 
 @pytest.mark.parametrize("start", "=+-@\t\r\n＝＋－＠")

@@ -19,7 +19,6 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.reporting import chart
 from pipelines.reporting.chart import MARK, Figure, refuse_foreign, write_figures
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.overlays import MOMENTS
@@ -34,7 +33,6 @@ from .conftest import (
     CAMERAS,
     JOINTS,
     OFFSET_M,
-    RATE_HZ,
     described,
     make_frames,
     make_keypoints,
@@ -385,20 +383,3 @@ def test_nothing_of_others_is_written_over(content: SessionContent, tmp_path: Pa
 
 
 # --- series ---
-
-
-def test_bins_hold_each_time_once_and_its_percentiles() -> None:
-    for count in (1, 299, 301, 5000):
-        seconds = np.arange(count) / RATE_HZ + 3.0
-        bins = chart.time_bins(seconds)
-        assert len(bins) - 1 == min(count, chart.MOST_BINS)
-        assert np.histogram(seconds, bins)[0].sum() == count
-    rng = np.random.default_rng(3)
-    seconds = np.arange(1200) / RATE_HZ
-    values = rng.random((1200, 2, 17))
-    values[400:420] = np.nan
-    middle, low, high = chart.percentiles(values, seconds, chart.time_bins(seconds))
-    # 300 bins of 4 times each.
-    expected = np.nanpercentile(values[:4], [50, 10, 90])
-    np.testing.assert_allclose([middle[0], low[0], high[0]], expected, rtol=1e-12)
-    assert np.flatnonzero(np.isnan(middle)).tolist() == list(range(100, 105))
