@@ -25,8 +25,8 @@ LEAST_NAMED_JOINTS = 6
 _SAMPLED_FILES = 8
 # Frame numbers below it, and their differences, fit int64.
 _FRAME_LIMIT = 2**62
-# ".jpg" and ".jp2" are suffixes, the ".0004" of "cam01.0004" is a frame number.
-_SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
+# ".jpg" and ".jp2" are suffixes; ".0004" of "cam01.0004" and "0007" of "GOPR0012.MP4_0007" are frame numbers.
+_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]*$")
 _CAMERA = re.compile(r"(?:cam|camera|view|drone)[_-]?[0-9]+", re.IGNORECASE)
 # No picture is so large, so a joint beyond it is damage.
 _FARTHEST_PX = 1_000_000
