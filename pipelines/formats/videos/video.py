@@ -318,7 +318,7 @@ class _CodedFrame(NamedTuple):
     pts: int | None
     key: bool
     sound: bool
-    size: int
+    is_guessed: bool  # its stamp of showing, where the container has none: a placeholder's, or in AVI
 
 
 def _scan(path: Path) -> _Scan:
@@ -334,11 +334,15 @@ def _scan(path: Path) -> _Scan:
 def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
     container, stream = open_container(path)
     with container:
-        codec = stream.codec_context.codec.canonical_name
+        codec, is_avi = stream.codec_context.codec.canonical_name, container.format.name == "avi"
         lengths = _bytes_of_lengths(codec, stream.codec_context.extradata or b"")
         stored = [
             _CodedFrame(
-                packet.pos, packet.pts, packet.is_keyframe, _is_sound(packet, codec, lengths), packet.size
+                packet.pos,
+                packet.pts,
+                packet.is_keyframe,
+                _is_sound(packet, codec, lengths),
+                (codec == "mpeg4" and packet.size < _NVOP_BYTES) or (is_avi and packet.pts != packet.dts),
             )
             for packet in packets(container, stream)
             if not packet.is_discard and is_shown(packet, codec)
@@ -347,8 +351,7 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
         tick_s, listed = Fraction(stream.time_base or 0), stream.frames
         is_raw = container.format.name in _RAW
-    is_packed = codec == "mpeg4" and min((packet.size for packet in stored), default=99) < _NVOP_BYTES
-    if is_raw or is_packed:
+    if is_raw or any(packet.is_guessed for packet in stored):
         return _scan_in_order(path, len(stored), Fraction(1) if is_raw else tick_s)
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
@@ -389,7 +392,7 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
 
 
 def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
-    """Decode a stream whose packets do not say what is shown when: a raw one, or packed MPEG-4."""
+    """Decode a stream whose packets do not say what is shown when: a raw one, packed MPEG-4, some AVI."""
     container, stream = open_container(path)
     with container:
         is_raw, codec = container.format.name in _RAW, stream.codec_context.codec.canonical_name

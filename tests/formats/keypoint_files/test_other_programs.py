@@ -139,7 +139,6 @@ def test_sleap(tmp_path: Path) -> None:
 
 
 def test_caliscope_of_one_camera(tmp_path: Path) -> None:
-    """The first picture lacks points, and no table says of which camera its rows are but `port`."""
     path, head = (
         tmp_path / "xy_HALPE26.csv",
         "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y",

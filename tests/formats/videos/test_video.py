@@ -110,6 +110,7 @@ def test_frames_that_vp8_never_shows_are_none(tmp_path: Path) -> None:
     [
         ("v.mp4", "libx264"),
         ("v.mkv", "libx264"),
+        ("v.avi", "libx264"),
         ("v.ts", "libx264"),
         ("v.mov", "mjpeg"),
         ("v.webm", "libvpx-vp9"),
@@ -282,16 +283,16 @@ def test_raw_streams_are_numbered_and_have_no_times(
 
 
 @pytest.mark.parametrize(
-    ("form", "b_frames", "lost", "left"),
+    ("form", "b_frames", "lost"),
     [
-        ("h264", 0, {25: b"\x55"}, 39),
-        ("h264", 0, {13: b"", 23: b""}, 38),
-        ("h264", 2, {7: b"", 29: b""}, 38),
-        ("hevc", 0, {20: b""}, 36),
+        ("h264", 0, {25: b"\x55"}),
+        ("h264", 0, {13: b"", 23: b""}),
+        ("h264", 2, {7: b"", 29: b""}),
+        ("hevc", 0, {20: b""}),
     ],
 )
 def test_pictures_that_a_raw_stream_lost_move_no_other(
-    tmp_path: Path, form: str, b_frames: int, lost: dict[int, bytes], left: int
+    tmp_path: Path, form: str, b_frames: int, lost: dict[int, bytes]
 ) -> None:
     """Picture 36 is a key frame, so what is shown from there on is whole."""
     path, codec = tmp_path / f"v.{form}", {"h264": "libx264", "hevc": "libx265"}[form]
@@ -306,7 +307,6 @@ def test_pictures_that_a_raw_stream_lost_move_no_other(
         shown = [read_bar_code(picture) for _, picture in reader.frames()]
     t_s = (reader.index.pts_ns // 10**9).tolist()
     assert t_s[-4:] == shown[-4:] == [36, 37, 38, 39]
-    assert len(t_s) == left
 
 
 def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
@@ -347,8 +347,6 @@ def test_real_recordings_decode_as_ffmpeg_does(name: str) -> None:
     ],
 )
 def test_the_stated_time_of_creation_is_read(tmp_path: Path, stated: str | None, made_ns: int | None) -> None:
-    import av
-
     path = tmp_path / "a.mp4"
     with av.open(str(path), "w", options={}) as container:
         if stated is not None:
