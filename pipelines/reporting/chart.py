@@ -368,7 +368,10 @@ def _draw(figure: Figure, width_in: float) -> Drawing:
 
     rows, across = len(figure.panels), max(len(row) for row in figure.panels)
     with page_style():
-        drawing = Drawing((width_in, figure.height_in), layout="constrained")
+        shaped = any(panel.equal and panel.x_span for row in figure.panels for panel in row)
+        # Panels whose shape is given become lower with their width; the rest of the height is their labels'.
+        height_in = figure.height_in * (0.3 + 0.7 * width_in / WIDTH_IN if shaped else 1.0)
+        drawing = Drawing((width_in, height_in), layout="constrained")
         grid = drawing.subplots(
             rows,
             across,
