@@ -45,6 +45,7 @@ from pipelines.geometry.noise import (
 )
 from pipelines.geometry.poses import (
     matrix_from_quaternion,
+    multiply,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
@@ -76,9 +77,8 @@ _LOSS = 1.0
 # Losses that come before it: where logged poses are many pixels off, a narrow one rejects all sightings
 # (graduated non-convexity: Blake and Zisserman 1987; Yang et al. 2020).
 _WIDE = (30.0, 5.0)
-# Two steps with a wide loss are too few for attitudes that are further off: 67 deg and a drifting path took
-# more than eight.
-_FAR_RAD, _FAR_ROUNDS = 0.1, 24
+# Attitudes that are further off begin where a search finds them and a stiff path turns them.
+_FAR_RAD, _FAR_ROUNDS, _STIFF_STARTS = 0.1, 24, 2
 # Two sightings of a point determine its direction and depth and test nothing.
 _FEWEST_SIGHTINGS = 3
 _LONGEST_S, _LONGEST = 1.0, (12, 30)  # sightings of a point: time, and at least and at most these pictures
@@ -89,6 +89,12 @@ _FEWEST_SHARED = 8
 # A background that loses more of the pictures than this share leaves too much to the log.
 _MOST_UNBOUND = 0.2
 _KINDS = (slice(0, 3), slice(3, 6))  # of the six numbers of an error: position, rotation
+# A start is sought this far from the log, in steps from half of which the least squares converge.
+_FARTHEST_DEG, _TRIED_STEP_DEG = 75.0, 15.0
+# So many points tell the turns of the search apart; more only take time.
+_SEARCHED_POINTS = 1000
+# A ray that turned by nearly 90 deg or more has lost its point.
+_BEHIND = 0.05
 # Points far from where they begin are where cameras see them after so many steps.
 _SETTLE_ROUNDS = 8
 _INVERSE_DEPTH = np.array([0.0, 0.01])  # mean (1/m) and precision (m^2) of the prior: farther than 1 m
@@ -514,6 +520,7 @@ class _Stretch:
     loosened: Float  # [T, 2] m, rad
     focal_px: float
     unbound: int  # pictures that share too few points with the one before
+    turn: Float  # [3] constant error that was taken out of the attitudes
 
     @classmethod
     def of(cls, whole: Background, rows: Int64, position: Float, rotation: Float) -> _Stretch:
@@ -550,6 +557,7 @@ class _Stretch:
             np.zeros((len(rows), 2)) if whole.loosened is None else whole.loosened[rows],
             whole.focal_px,
             int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
+            np.zeros(3),
         )
 
     def solve_with_levels(self, prior: PosePrior) -> _SolvedStretch | None:
@@ -560,14 +568,14 @@ class _Stretch:
         with a camera that does not move at all.
         """
         stands = self._standing(prior)
-        far = prior.constant[1] > _FAR_RAD
-        again = (
-            replace(self, points=BackgroundPoints(*(each.copy() for each in self.points))) if far else None
-        )
-        free = self._solved(prior)
-        if again is not None and (free is None or np.median(free.missed) > _WORST_PX):
-            both = [each for each in (free, again._solved(prior, stiff=True)) if each is not None]
-            free = min(both, key=_misfit, default=None)
+        begun, state = self._begun(prior)
+        free = begun._solved(prior, state)
+        if free is not None:
+            whole = multiply(
+                quaternion_from_rotation_vector(free.errors[:, 3:]),
+                quaternion_from_rotation_vector(begun.turn),
+            )
+            free.errors[:, 3:] = rotation_vector_from_quaternion(whole)
         if stands is None or (free is not None and _misfit(stands) > _misfit(free) + _STANDS):
             return free
         return stands
@@ -617,25 +625,77 @@ class _Stretch:
         step = self.knot_t_s[self.knot + 1] - self.knot_t_s[self.knot]
         return np.asarray(self.knot_t_s[self.knot] + self.share * step)
 
+    def _begun(self, prior: PosePrior) -> tuple[_Stretch, _StretchState | None]:
+        """Take the constant rotation error out of the log, roughly, where it may be large; return a start."""
+        if prior.constant[1] <= _FAR_RAD or len(self.seen.first) < 2:
+            return self, None
+        # A path that is free to bend may bend where the camera should turn: a stiff one turns first.
+        stiff = _with_position_levels(prior, prior.white[0], _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]))
+        begun, turn, found = self, self._searched(prior), None
+        for _ in range(_STIFF_STARTS):
+            begun, zero = begun._turned(turn), self._zero(prior)
+            found = begun._solve(zero, stiff, rounds=_FAR_ROUNDS, loss=_WIDE[0], settle=_SETTLE_ROUNDS)
+            if found is None:
+                return self, None
+            turn = found[0].constant[3:6]
+        return begun, None if found is None else found[0]
+
+    def _zero(self, prior: PosePrior) -> _StretchState:
+        constant = np.zeros(len(_sigma_of_constants(prior)))
+        return _StretchState(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
+
+    def _turned(self, turn: Float) -> _Stretch:
+        """Take a constant error [3] out of the attitudes, so that small ones are left."""
+        rotation = self.rotation @ matrix_from_quaternion(quaternion_from_rotation_vector(-turn))
+        points = _far_points(self.seen.first, self.seen.picture, self.seen.rays, self.points.origin, rotation)
+        whole = multiply(quaternion_from_rotation_vector(turn), quaternion_from_rotation_vector(self.turn))
+        return replace(self, rotation=rotation, points=points, turn=rotation_vector_from_quaternion(whole))
+
+    def _searched(self, prior: PosePrior) -> Float:
+        """Search for a constant rotation error [3] with which rays move away from where the camera flies.
+
+        Any inverse depth up to that of 1 m fits, so a likely error decides where the path is straight.
+        """
+        every = -(-(len(self.seen.first) - 1) // _SEARCHED_POINTS)
+        ends = self.seen.first[:-1:every], self.seen.first[1::every] - 1
+        picture = [self.seen.picture[end] for end in ends]
+        ray = [np.insert(self.seen.rays[end], 2, 1.0, axis=1) for end in ends]
+        ray = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in ray]
+        way = self.position[picture[1]] - self.position[picture[0]]
+        best, least = np.zeros(3), np.inf
+        steps = np.radians(np.arange(-_FARTHEST_DEG, _FARTHEST_DEG + 1, _TRIED_STEP_DEG))
+        for turn in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3):
+            if np.linalg.norm(turn) > np.radians(_FARTHEST_DEG):
+                continue
+            back = matrix_from_quaternion(quaternion_from_rotation_vector(-turn))
+            first, last = (
+                np.einsum("kij,kj->ki", self.rotation[rows], each @ back.T)
+                for rows, each in zip(picture, ray, strict=True)
+            )
+            ahead = np.maximum((first * last).sum(axis=1, keepdims=True), _BEHIND)
+            moved = last / ahead - first
+            across = (first * way).sum(axis=1, keepdims=True) * first - way
+            square = np.maximum(np.square(across).sum(axis=1, keepdims=True), EXACT)
+            inverse = np.clip((moved * across).sum(axis=1, keepdims=True) / square, 0.0, 1.0)
+            missed = np.square((moved - inverse * across) * self.focal_px / _WIDE[0]).sum(axis=1)
+            cost = float(np.log1p(missed).sum() + np.square(turn / prior.constant[1]).sum() / 2)
+            if cost < least:
+                best, least = turn, cost
+        return best
+
     def _solved(
         self,
         prior: PosePrior,
+        state: _StretchState | None = None,
         *,
         positions_known: bool = False,
-        stiff: bool = False,
         level_rounds: int = _LEVEL_ROUNDS,
     ) -> _SolvedStretch | None:
-        # A path that is free to bend may bend where the camera should turn: a stiff one turns first.
-        slow = _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0])
-        stages = [(loss, prior) for loss in _WIDE]
-        if stiff:
-            stages = [(_WIDE[0], _with_position_levels(prior, prior.white[0], slow)), *stages]
-        constant = np.zeros(len(_sigma_of_constants(prior)))
-        state = _StretchState(np.zeros((len(self.rows), 6)), np.zeros((len(self.knot_t_s), 6)), constant)
-        for loss, start in stages:
+        stages = _WIDE if state is None else _WIDE[1:]
+        state = self._zero(prior) if state is None else state
+        for loss in stages:
             settle = _SETTLE_ROUNDS if loss == _WIDE[0] else 0
-            rounds = _FAR_ROUNDS if prior.constant[1] > _FAR_RAD else 2
-            found = self._solve(state, start, rounds=rounds, loss=loss, settle=settle)
+            found = self._solve(state, prior, rounds=2, loss=loss, settle=settle)
             if found is None:
                 return None
             state = found[0]
@@ -647,7 +707,7 @@ class _Stretch:
             levels = self._estimated(state, self._draws(factored, 8), prior)
             if positions_known:
                 levels = _with_position_levels(levels, prior.white[0], prior.slow[0])
-            prior = with_constant_levels(levels, state.constant[3:9], factored.corner[3:9, 3:9])
+            prior = with_constant_levels(levels, self._of_log(state.constant)[3:9], factored.corner[3:9, 3:9])
         found = self._solve(state, prior, rounds=_ROUNDS)
         if found is None:
             return None
@@ -674,7 +734,7 @@ class _Stretch:
             at, turn = _without(state.errors, self.position, self.rotation)
             band, force = np.zeros((size, self._width())), np.zeros(size)
             border = np.zeros((size, len(steady)))
-            corner, pull = np.diag(steady), -steady * state.constant
+            corner, pull = np.diag(steady), -steady * self._of_log(state.constant)
             eliminate_points(
                 self.seen,
                 self.points,
@@ -689,7 +749,8 @@ class _Stretch:
                 missed,
                 kept,
             )
-            settle = 0
+            # Linear moves of points are too long where attitudes turn by much.
+            settle = 1 if prior.constant[1] > _FAR_RAD else 0
             add_ties(ties, self._design(turn, prior), *_parts(state), band, force, border, corner, pull)
             factor, failed = dpbtrf(band.T, lower=1, overwrite_ab=1)
             if failed:
@@ -709,6 +770,12 @@ class _Stretch:
             if (np.abs(step).reshape(-1, 2, 3).max(axis=(0, 2)) < _CONVERGED).all():
                 break
         return state, _Factored(factor, both[:, :-1], covariance), missed[np.isfinite(missed)]
+
+    def _of_log(self, constant: Float) -> Float:
+        """Return the constant errors of the log as it was, before it was turned."""
+        whole = constant.copy()
+        whole[3:6] += self.turn
+        return whole
 
     def _design(self, rotation: Float, prior: PosePrior) -> Float:
         """Compute the derivatives [T, 6, 9 or 10] of the errors by the constant ones."""
@@ -985,6 +1052,13 @@ def refine_cameras(
         else:
             t_ns = camera.frame_t_ns[seen.rows]
             found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
+            aside = None if found.refused is None else _found_aside(camera, seen, between)
+            if aside is not None:
+                found, angle, _ = aside
+                warnings.append(
+                    f"{camera.name}: its pictures, which are believed, show that it looks"
+                    f" {np.degrees(angle):.0f} deg beside its logged attitudes"
+                )
             refined.append(_with_poses(camera, t_ns, found))
             used = found.refused is None
             turn = np.diagonal(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean(axis=1)
@@ -1017,6 +1091,13 @@ def turned_aside(camera: Camera, followed: Followed, between: Interpolation) -> 
     The camera may be turned by any constant rotation in its own axes. None if the background does not tell,
     or if the angle is one of usual mounts, compasses and satellite positions.
     """
+    found = _found_aside(camera, followed, between)
+    return None if found is None else found[1:]
+
+
+def _found_aside(
+    camera: Camera, followed: Followed, between: Interpolation
+) -> tuple[Adjusted, float, float] | None:
     prior = PosePrior.of(None)
     position, _, arm = prior.constant
     at = camera.poses_at(camera.frame_t_ns[followed.rows], between)
@@ -1030,7 +1111,7 @@ def turned_aside(camera: Camera, followed: Followed, between: Interpolation) -> 
     turn = rotation_vector_from_quaternion(turns).mean(axis=0)
     precision = np.linalg.inv(found.covariance[posed, 3:, 3:].mean(axis=0))
     angle, sigmas = float(np.linalg.norm(turn)), float(np.sqrt(turn @ precision @ turn))
-    return (angle, angle / sigmas) if angle > _LEAST_ASIDE_RAD and sigmas > _SIGMAS else None
+    return (found, angle, angle / sigmas) if angle > _LEAST_ASIDE_RAD and sigmas > _SIGMAS else None
 
 
 def clocks_of_backgrounds(

@@ -572,11 +572,11 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
 
 
 @pytest.mark.parametrize("places", [Bias(position_m=1.5), GaussMarkov(position_m=1.5, correlation_s=100)])
-def test_a_bias_of_20_deg_is_found_beside_white_errors_that_nobody_stated(places: NoiseModel) -> None:
+def test_a_bias_of_40_deg_is_found_beside_white_errors_that_nobody_stated(places: NoiseModel) -> None:
     rng = np.random.default_rng(3)
     position, rotation = flown(60, 8.0)
     at, turned = logged(position, rotation, rng)
-    wrong = turned @ matrix_from_quaternion(quaternion_from_rotation_vector(np.radians([12.0, -14.0, 9.0])))
+    wrong = turned @ matrix_from_quaternion(quaternion_from_rotation_vector(np.radians([24.0, -28.0, 18.0])))
     stated = PosePrior.of(pose_errors([places, Bias(rotation_deg=20)]))
     found = adjusted(*sighted(position, rotation, rng), (at + 1.5, wrong), stated)
     assert found.left is not None, found.refused
