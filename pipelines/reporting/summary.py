@@ -428,6 +428,8 @@ DOUBTFUL_COVERAGE = 0.8
 NOTABLE_LOSS = 0.01
 # The first screen has room for so many reasons.
 MOST_REASONS = 3
+# A longer reason would push the person from the first screen of a phone; it stands whole below.
+MOST_REASON_CHARACTERS = 120
 
 
 @dataclass(frozen=True)
@@ -508,7 +510,8 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
     given = section(summary.metrics, "verdict")
     grade = text(given, "grade")
     lead = f"{percent(summary.share)} of the joints were measured."
-    why = tuple(str(each) for each in items(given, "why"))[:MOST_REASONS] or worst
+    reasons = tuple(str(each) for each in items(given, "why"))[:MOST_REASONS] or worst
+    why = tuple(map(_short, reasons))
     following = text(given, "next").replace("SESSION", session)
     if not following or following.startswith("mocap report"):  # that is this page
         following = f"mocap export {session} --to trc,angles"
@@ -520,6 +523,12 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
     if (measured := number(summary.metrics, "mpjpe_mm")) is not None:
         error += f"{'; ' if error else ''}{quantity(measured, 'mm', 0)} against truth"
     return Verdict(grade, lead, error, why, following, doubts)
+
+
+def _short(reason: str) -> str:
+    """Cut a reason between two words for the first screen."""
+    kept = reason[:MOST_REASON_CHARACTERS]
+    return reason if kept == reason else f"{kept.rpartition(' ')[0]} …"
 
 
 def _reason_for_no_result(summary: Summary) -> str:
