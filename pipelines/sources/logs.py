@@ -3,6 +3,7 @@
 If no topic is stated, the only candidate of its kind is taken, and a note names it.
 """
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -51,6 +52,9 @@ MAX_KEPT_MESSAGES = 4_000_000
 
 # A process may hold some hundred files open, and a split log has many.
 MAX_KEPT_FILES = 64
+
+# Foxglove's and ffmpeg_image_transport's packets need those before them.
+_CODED_VIDEO = re.compile(r"CompressedVideo$|FFMPEGPacket$")
 
 _NOUNS: dict[Kind, str] = {
     "poses": "poses",
@@ -103,6 +107,9 @@ class FlightLog:
             type_ = self.type_of(topic)
             problem = f"topic {topic} holds {type_}, no {noun}" if type_ else f"has no topic {topic}"
             remedy = f"topics with {noun}: {listed}"
+            if type_ is not None and _CODED_VIDEO.search(type_):
+                problem = f"topic {topic} holds coded video ({type_}), which is not read from logs"
+                remedy = "write its stream to a .h264 file, and its stamps to a CSV for frame_times"
             if type_ in FIXES and noun == _NOUNS["poses"]:
                 turned = next((b for a, b in pairs_of(self.recording.topics) if a == topic), "TOPIC")
                 problem += ", but positions alone"
