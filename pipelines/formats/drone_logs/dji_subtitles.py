@@ -311,20 +311,25 @@ class DjiSrtFormat(DroneLog):
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read positions, interpolated where they are repeated, and angles of body and gimbal."""
-        subtitles = read_subtitles(path)
-        return telemetry_of_rows(path, _rows(subtitles), choice, [_note_on_clock(subtitles)])
+        rows, notes = _rows(read_subtitles(path))
+        return telemetry_of_rows(path, rows, choice, notes)
 
     def read_attitudes(self, path: Path) -> Attitudes:
         """Read the gimbal's angles, also where the drone had no position."""
-        subtitles = read_subtitles(path)
-        found = attitudes_of_rows(path, _rows(subtitles))
-        return replace(found, notes=(f"{path}: {_note_on_clock(subtitles)}",))
+        rows, notes = _rows(read_subtitles(path))
+        return replace(attitudes_of_rows(path, rows), notes=(f"{path}: {notes[0]}",))
 
 
-def _rows(subtitles: Subtitles) -> DjiRows:
-    columns = _columns(subtitles.texts)
+def _rows(subtitles: Subtitles) -> tuple[DjiRows, list[str]]:
+    """Return the rows, and notes of which the first is on the clock."""
+    columns, notes = _columns(subtitles.texts), [_note_on_clock(subtitles)]
+    latitude, longitude = columns["latitude"], columns["longitude"]
+    beyond = np.count_nonzero(np.abs(latitude) > 90)
+    if 2 * beyond > np.count_nonzero(np.isfinite(latitude)) and not (np.abs(longitude) > 90).any():
+        columns |= {"latitude": longitude, "longitude": latitude}
+        notes.append("its latitudes are beyond 90 deg: taken for longitudes, and these for latitudes")
     t_ns, timed = subtitles.times()
-    return DjiRows(
+    rows = DjiRows(
         t_ns,
         timed,
         columns,
@@ -332,18 +337,13 @@ def _rows(subtitles: Subtitles) -> DjiRows:
         names=("F.PRY", "its gimbal angles"),
         rows="subtitles",
     )
+    return rows, notes
 
 
 def _columns(texts: Sequence[str]) -> dict[str, Float]:
     """Return all columns of `_COLUMNS`, [B] each, NaN if a subtitle does not hold the value."""
     rows = [_fields(text) for text in texts]
-    columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
-    latitude, longitude = columns["latitude"], columns["longitude"]
-    beyond = np.count_nonzero(np.abs(latitude) > 90)
-    if 2 * beyond > np.count_nonzero(np.isfinite(latitude)) and not (np.abs(longitude) > 90).any():
-        # GPS(latitude, longitude, n): no latitude is beyond 90 degrees.
-        columns |= {"latitude": longitude, "longitude": latitude}
-    return columns
+    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
 
 
 def _fields(text: str) -> dict[str, float]:
