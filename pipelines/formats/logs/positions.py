@@ -27,14 +27,14 @@ FIXES = (
 
 # NavSatFix and GPSFix say by this status that there is no fix.
 _NO_FIX = -1
-_AIRSIM = re.compile(r"(^|/)odom_local_ned$")
+_AIRSIM = re.compile(r"(^|/)airsim_node/[^/]+/odom_local_ned$")
 _TURNED = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped")
 
 
 def axes_of_topic(topic: str | None, parent: str | None) -> Axes | None:
     """Return the axes that a known program gives its poses, by the name of the topic or of their frame.
 
-    AirSim's odom_local_ned, whatever the node is called, and frames below world_ned are NED and FRD.
+    AirSim's node: /airsim_node/VEHICLE/odom_local_ned and frames below world_ned are NED and FRD.
     """
     return "ned" if _AIRSIM.search(topic or "") or (parent or "").strip("/") == "world_ned" else None
 
