@@ -438,10 +438,9 @@ class _GroupPlanner(_TeamPlanner):
         """Return the views of a drone that begins to film somebody else: none before it can have arrived."""
         config = self._config
         way = np.linalg.norm(view.position - place, axis=-1)
-        most_m = config.speed_mps**2 / config.acceleration_mps2
-        takes_s = np.where(
-            way < most_m, 2.0 * np.sqrt(way / config.acceleration_mps2), (way + most_m) / config.speed_mps
-        )
+        acceleration_mps2, speed_mps = config.acceleration_mps2, config.ground_speed_mps
+        most_m = speed_mps**2 / acceleration_mps2
+        takes_s = np.where(way < most_m, 2.0 * np.sqrt(way / acceleration_mps2), (way + most_m) / speed_mps)
         there = takes_s <= config.tuning.knot_s * np.arange(1, len(way) + 1)[:, None]
         return view._replace(
             start=slot_of(place - about),

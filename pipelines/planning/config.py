@@ -123,7 +123,7 @@ class Imperfections:
     latency_s: Annotated[float, Field(ge=0, le=10, strict=True)] = 0.0
     # For this share of the time drones neither hear where the actor is, nor of new formations.
     outage_share: Annotated[float, Field(ge=0, lt=1, strict=True)] = 0.0
-    # The wind blows to the east and north with these speeds, and costs energy.
+    # The wind to the east and north, which slows drones and changes their energy.
     wind_mps: tuple[Speed, Speed] = (0.0, 0.0)
     # Gusts have this standard deviation along level axes, half of it upwards.
     gust_mps: NotNegative = 0.0
@@ -202,6 +202,11 @@ class PlannerConfig:
         return self.actor_distance_m + margin_m if self.actor_distance_m else 0.0
 
     @property
+    def ground_speed_mps(self) -> float:
+        """Speed over the ground that a drone reaches in any direction of the wind."""
+        return self.speed_mps - math.hypot(*self.imperfections.wind_mps)
+
+    @property
     def slot_rates(self) -> tuple[float, float, float]:
         """Rates of change of a slot's yaw (rad/s), tilt (rad/s) and range (m/s)."""
         tilt_rate = math.radians(self.tuning.tilt_rate_deg_per_s)
@@ -246,6 +251,11 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
         for found in error.errors():
             place = ".".join(str(part) for part in found["loc"])
             problems.append(f"{place}: {found['msg']}")
+    else:
+        if config.ground_speed_mps <= 0.0:
+            problems.append(
+                f"imperfections.wind_mps: drones of {config.speed_mps:g} m/s cannot fly against it"
+            )
     if problems:
         raise DataError(source, "; ".join(problems), remedy, code="bad-value")
     return config

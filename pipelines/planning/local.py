@@ -91,7 +91,7 @@ def flying_of(config: PlannerConfig) -> Flying:
         config.tuning.k_integral,
         config.acceleration_mps2,
         config.jerk_mps3,
-        config.speed_mps,
+        config.ground_speed_mps,
         1.0 / config.tuning.tracking_hz,
     )
 

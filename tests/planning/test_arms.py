@@ -220,6 +220,7 @@ def test_what_is_not_mentioned_keeps_its_default() -> None:
         ({"tilt_deg": 88}, "tilt_deg"),
         ({"tuning": {}}, "tuning"),
         ({"imperfections.wind": 3}, "imperfections.wind"),
+        ({"imperfections.wind_mps": [0.0, 9.0]}, "wind_mps"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_by_name(values: dict[str, object], named: str) -> None:
@@ -349,6 +350,7 @@ def test_imperfections_of_a_flight_can_be_set() -> None:
     expected = (propulsion_w(level, 0 * level) * 0.02).sum(axis=1) / 1e3
     assert against == pytest.approx(expected, rel=0.01)
     assert (against < still).all()  # the published model is least at 10 m/s
+    assert np.linalg.norm(flown_with(wind_mps=(0.0, -7.0)).velocity, axis=-1).max() <= 1.0 + 1e-6
 
     empty = flown_with(battery_kj=float(still.min()) / 2)
     assert 0.4 < empty.known.mean() < 0.6
