@@ -8,12 +8,22 @@ import click
 
 from mocap_cli.options import json_option
 from mocap_cli.several import each
-from mocap_cli.terminal import one_line, say
+from mocap_cli.terminal import one_line, say, say_next
 
 # Longer lists are cut, so that each stays on a line or two.
 _MAX_LISTED = 12
 # Numbers from here on are written with all digits before the point: stamps and counts.
 _LARGE = 1e6
+
+_NEXT = {
+    "session": "mocap report {}",
+    "simulated flight": "mocap run {}",
+    "flight manifest": "mocap check {}",
+    "scenario": "mocap simulate {} -o FOLDER",
+    "planner settings": "mocap replan-compare SESSION --config {}",
+    "study, simulated": "mocap report SESSION --study {}",
+}
+"""The next command after a look at something that is no file of a flight, by its kind."""
 
 
 @click.command("info", short_help="Print the content of a file or session.")
@@ -34,6 +44,8 @@ def info_command(path: Path, as_json: bool) -> dict[str, Any] | None:
     for reading in readings:
         say(f"{reading.path}: {reading.title}")
         _print_facts(reading.facts, indent=2)
+    if readings:
+        say_next(_NEXT.get(readings[-1].title, "mocap init {}"), path, quiet=False)
     return None
 
 

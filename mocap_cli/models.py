@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from mocap_cli.options import any_path, json_option
-from mocap_cli.terminal import print_json, print_table, say
+from mocap_cli.terminal import print_json, print_table, say, say_next
 
 if TYPE_CHECKING:
     from pipelines.session.registries import Detector
@@ -59,6 +59,7 @@ def _list(as_json: bool) -> None:
         say(f"{family.title}: --detector {first}")
         for line in more:
             say(f"  {line}")
+    say_next("mocap reconstruct SESSION --detector {}", detectors[0].name, quiet=False)
 
 
 @models_command.command("fetch")
@@ -81,6 +82,7 @@ def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
         return
     for path in detector.models().values():
         say(f"ready: {path}")
+    say_next("mocap reconstruct SESSION --detector {}", name, quiet=False)
 
 
 def _listed(detector: Detector) -> dict[str, object]:
