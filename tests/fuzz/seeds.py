@@ -130,6 +130,7 @@ SEEDS: dict[str, Writer] = {
     "ardupilot": lambda folder: drone_logs.write_dataflash(folder / "a.bin", _truth(folder)),
     "bvh": _text("a.bvh", test_bvh.TEXT),
     "c3d": lambda folder: test_c3d.write(folder / "a.c3d", walking(12)),
+    "caliscope_keypoints": _text("xy_halpe26.csv", test_other_programs.caliscope()),
     "camera_info": lambda folder: test_ros_camera_info.stored(folder / "left.yaml"),
     "camera_info as ini": _text("left.ini", test_ros_camera_info.INI),
     "camodocal": _text("cam.yaml", test_camodocal.HEAD.format("MEI") + test_camodocal.mei()),
