@@ -383,7 +383,10 @@ def _gather_caliscope(people: Gathering) -> None:
     """Add the person of each picture by `frame_index`; `port`, later `cam_id`, must be one camera."""
     path, names = people.path, points_of_caliscope(people.path)
     people.joint_names = tuple(dict.fromkeys(names.values()))
-    rows = [row for row in csv.DictReader(read_text(path).splitlines()) if any(row.values())]
+    text = read_text(path)
+    if not _is_caliscope(text):
+        raise DataError(path, "has no columns of caliscope", "export it again", code="missing-column")
+    rows = [row for row in csv.DictReader(text.splitlines()) if any(row.values())]
     cameras = sorted({str(row.get("cam_id", row.get("port"))) for row in rows})
     if len(cameras) > 1:
         problem = f"holds keypoints of {len(cameras)} cameras ({', '.join(cameras)[:60]})"
