@@ -20,7 +20,7 @@ SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
 """Units of time, each as the power of ten by which it exceeds a nanosecond."""
 
 _UNITS = {"s": SECONDS, "sec": SECONDS, "ms": MILLISECONDS, "us": MICROSECONDS, "ns": NANOSECONDS}
-_STAMP_NAMES = {"t", "time", "timestamp", "stamp"}
+_STAMP_NAMES = {"t", "time", "timestamp", "stamp", "utc", "datetime", "gps_time", "utc_time", "unix_time"}
 _SPLIT_STAMP = re.compile(r"(?:(?:header_)?(?:t|time|timestamp|stamp)_)?(secs?|nsecs?|nanosecs?)")
 # Stamps are int64, and this is its largest number.
 _LARGEST = 2**63 - 1

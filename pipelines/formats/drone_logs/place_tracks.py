@@ -7,9 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.compute as pc
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.rows import Heading, describe_times, find_heading, parse_stamps, rows_below
+from pipelines.formats.common.rows import (
+    METRES,
+    Heading,
+    cell_name,
+    describe_times,
+    find_heading,
+    parse_stamps,
+    rows_below,
+)
 from pipelines.formats.drone_logs.dji_records import FORMAT as DJI_RECORD
 from pipelines.formats.drone_logs.telemetry_rows import DroneLog, attitude_track, position_track
 from pipelines.formats.poses import POSITION, QUATERNION, find_poses, is_airsim
@@ -23,13 +32,12 @@ from pipelines.session.storage import empty, read_text
 _POINT = re.compile(r"(?s)<(?:\w+:)?trkpt\b([^>]*)>(.*?)</(?:\w+:)?trkpt>")
 _ATTRIBUTE = r"\b{}\s*=\s*[\"']([^\"']*)[\"']"
 _ELEMENT = r"<(?:\w+:)?{0}>([^<]*)</(?:\w+:)?{0}>"
-_ON_EARTH = (
-    ("latitude", "lat", "latitude_deg"),
-    ("longitude", "lon", "lng", "longitude_deg"),
-    ("altitude", "alt", "ele", "elevation", "height", "altitude_m"),
-)
-_METRES = (("x",), ("y",), ("z",))
-_ATTITUDE = {"qw", "q_w", "yaw", "heading", "pitch", "roll"}
+_OF_RECEIVER = r"(?:(?:gps|gnss|pos|position|p)_?)?"
+_HEIGHT = r"(?:alt|altitude|ele|elevation|height)(?:_a?msl)?(?:_m)?"
+_ON_EARTH = (r"lat(?:itude)?(?:_deg)?", r"(?:lon|long|lng|longitude)(?:_deg)?", _HEIGHT)
+_METRES = (r"(?:x|e|east|easting)(?:_m)?", r"(?:y|n|north|northing)(?:_m)?", rf"(?:z|u|up)(?:_m)?|{_HEIGHT}")
+_UNITS = {"": 1.0, "deg": 1.0, "degrees": 1.0, "°": 1.0, **METRES}
+_ATTITUDE = {"qw", "q_w", "yaw", "pitch", "roll"}
 
 
 @dataclass(frozen=True)
@@ -88,35 +96,51 @@ def _read_gpx(path: Path) -> tuple[Int64, Bool, Float, bool]:
     return t_ns, timed, values.reshape(-1, 3), True
 
 
-def _columns(text: str) -> tuple[Heading, dict[str, int], bool] | None:
-    """Return the heading of a table of places, its three columns, and True for degrees; None without."""
-    heading = find_heading(text.partition("\n")[0])
-    of_others = _ATTITUDE | {"joint", "keypoint"}  # poses, or joints of people
-    if heading is None or of_others & heading.names.keys():
-        return None
-    for on_earth, wanted in ((True, _ON_EARTH), (False, _METRES)):
-        columns = {
-            names[0]: heading.names[name]
-            for names in wanted
-            for name in reversed(names)
-            if name in heading.names
-        }
-        if len(columns) == len(wanted):
-            return heading, columns, on_earth
+def _columns(text: str) -> tuple[Heading, dict[str, int], list[float], bool] | None:
+    """Return the heading of a table of places, its three columns, their units, and True for degrees; or None.
+
+    Lines of comments may stand above the heading.
+    """
+    for index, line in enumerate(text.split("\n", 100)[:100]):
+        heading = find_heading(line.lstrip("# "), index)
+        of_others = _ATTITUDE | {"joint", "keypoint"}  # poses, or joints of people
+        if heading is not None and not of_others & heading.names.keys():
+            units = dict(cell_name(cell) for cell in reversed(line.lstrip("# ").split(heading.delimiter)))
+            for on_earth, wanted in ((True, _ON_EARTH), (False, _METRES)):
+                found = [
+                    next(
+                        (name for name in heading.names if re.fullmatch(_OF_RECEIVER + f"(?:{each})", name)),
+                        "",
+                    )
+                    for each in wanted
+                ]
+                of_each = [_UNITS.get(units.get(name) or "") for name in found]
+                if all(found) and None not in of_each:
+                    columns = {name: heading.names[name] for name in found}
+                    return heading, columns, [unit for unit in of_each if unit is not None], on_earth
+        if not line.startswith("#"):
+            return None
     return None
 
 
 def _read_table(path: Path) -> tuple[Int64, Bool, Float, bool]:
-    """Read a table whose heading names a time and places, separated by commas, semicolons or tabs."""
+    """Read a table whose heading names a time and places, separated by commas, semicolons or tabs.
+
+    A date in a column of its own stands before the time of the day.
+    """
     text = read_text(path)
     found = _columns(text)
     if found is None:
         problem = "has no heading that names times and places"
         raise DataError(path, problem, "name t, latitude, longitude, altitude", code="missing-column")
-    heading, columns, on_earth = found
-    table = rows_below(path, heading, text, {}, columns)
-    t_ns, timed = parse_stamps(path, table.text["stamp"], heading.unit, unit_stated=heading.unit_stated)
-    return t_ns, timed, table.stack([*columns]), on_earth
+    heading, columns, units, on_earth = found
+    dated = {"date": heading.names["date"]} if "date" in heading.names else {}
+    table = rows_below(path, heading, text, dated, columns)
+    stamps = table.text["stamp"]
+    if dated:
+        stamps = pc.binary_join_element_wise(table.text["date"], stamps, " ")
+    t_ns, timed = parse_stamps(path, stamps, heading.unit, unit_stated=heading.unit_stated)
+    return t_ns, timed, table.stack([*columns]) * units, on_earth
 
 
 GPX = PlaceTrack("gpx", "GPX track", (".gpx",), lambda head: "<gpx" in head, _read_gpx)

@@ -41,6 +41,12 @@ def test_a_gpx_track_has_places_and_times(tmp_path: Path) -> None:
         ("t_ns,x,y,z\n1000,1,2,3\n2000,1.5,2,3\n", [[1, 2, 3], [1.5, 2, 3]], False),
         ("time;lat;lon;ele\n1.0;47.5;8.5;4\n2.0;47.5;8.6;5\n", [[47.5, 8.5, 4], [47.5, 8.6, 5]], True),
         ("z,y,x,timestamp [ms]\n3,2,1,1\n3,2,1.5,2\n", [[1, 2, 3], [1.5, 2, 3]], False),
+        (
+            "# walk\nutc,GPS Lat,gps_long,Height (ft)\n1,47,8,10\n2,47,9,10\n",
+            [[47, 8, 3.048], [47, 9, 3.048]],
+            True,
+        ),
+        ("date,time,East,North,Up,speed,heading\n2026-05-01,10:00:00,1,2,3,4,5\n", [[1, 2, 3]], False),
     ],
 )
 def test_a_table_of_places_is_read(
