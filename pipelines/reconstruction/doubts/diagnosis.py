@@ -121,7 +121,7 @@ _REACH = 1.0
 _WITHOUT_CAUSE = 9.0
 # Rays of a right flight scatter and miss each other by less, also where a remedy is not exact.
 _MEETING, _LEFT_MISFIT = 0.9, 2.5
-# Sums of chi^2 in other pictures differ by more standard deviations in one of forty cases.
+# Sums of chi^2 in other pictures, of which a clock's search tries many, differ by so many deviations.
 _MOST_BY_CHANCE = 2.0
 # In this time people and cameras move by more than keypoints err; so far is a clock followed.
 _RAYS_STEP_S, _MOST_STEPS = 0.05, 20
@@ -409,7 +409,7 @@ class Objective:
         while towards and abs(best) < _MOST_STEPS and saved(best + towards) > saved(best):
             best += towards
         bend = 2 * saved(best) - saved(best - 1) - saved(best + 1)
-        least = LEAST_SIGMAS**2 + self._chance(self.described.cost, [index])
+        least = LEAST_SIGMAS**2 + _MOST_BY_CHANCE * self._chance(self.described.cost, [index])
         if not best or saved(best) < least or not 0 < bend < np.inf:
             return None
         late_s = (best + (saved(best + 1) - saved(best - 1)) / (2 * bend)) * _RAYS_STEP_S
@@ -479,9 +479,8 @@ class Objective:
         return self._fit(replace(described, rays=rays)).cost * float(seen.sum() / kept.sum())
 
     def _chance(self, cost: float, cameras: list[int]) -> float:
-        """Return by how much the chi^2 may fall where moments are of other pictures, with other errors."""
-        deviation = np.sqrt(2 * self._pictures[cameras].sum()) / self._pictures.sum()
-        return cost * _MOST_BY_CHANCE * float(deviation)
+        """Return the deviation of the chi^2 where moments are of other pictures, with other errors."""
+        return cost * float(np.sqrt(2 * self._pictures[cameras].sum()) / self._pictures.sum())
 
     def compared(self, tried: Tried) -> Compared:
         """Return the objective of the description, and that of an alternative with its price.
@@ -500,7 +499,9 @@ class Objective:
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
         if tried.alternative.code in TIMES:
             others = [self.trial.names.index(name) for name in tried.alternative.cameras]
-            chance = self._chance(before, others)
+            # Few rates are tried.
+            sigmas = 1.0 if tried.alternative.code == "frame_rate" else _MOST_BY_CHANCE
+            chance = sigmas * self._chance(before, others)
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
         return Compared(*scores, self._rays(before, described), self._rays(cost, scene))
