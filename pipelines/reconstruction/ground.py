@@ -844,7 +844,7 @@ def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Sol
 
 
 def _rotation_level(cameras: Sequence[Camera], level: float, solution: _Solution) -> float:
-    """Estimate the level (rad) of constant rotations by the same rule; infinite where none is assumed."""
+    """Estimate the level (rad) of constant rotations of logs by the same rule."""
     squares, determined = 0.0, 0.0
     for modes, mean in _rotated(cameras):
         before = min(level, modes.turn_sigma)
