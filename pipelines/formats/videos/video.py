@@ -334,7 +334,8 @@ def _scan(path: Path) -> _Scan:
 def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
     container, stream = open_container(path)
     with container:
-        codec, is_avi = stream.codec_context.codec.canonical_name, container.format.name == "avi"
+        codec, kind = stream.codec_context.codec.canonical_name, container.format.name
+        reorders = kind == "mxf" and bool(stream.codec_context.has_b_frames)
         lengths = _bytes_of_lengths(codec, stream.codec_context.extradata or b"")
         stored = [
             _CodedFrame(
@@ -342,7 +343,9 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
                 packet.pts,
                 packet.is_keyframe,
                 _is_sound(packet, codec, lengths),
-                (codec == "mpeg4" and packet.size < _NVOP_BYTES) or (is_avi and packet.pts != packet.dts),
+                # AVI has stamps of decoding alone, and so does MXF without an index.
+                (codec == "mpeg4" and packet.size < _NVOP_BYTES)
+                or (reorders if packet.pts == packet.dts else kind == "avi"),
             )
             for packet in packets(container, stream)
             if not packet.is_discard and is_shown(packet, codec)
@@ -350,7 +353,7 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         # Only a complete table, like that of MP4, lists frames beyond the file's end.
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
         tick_s, listed = Fraction(stream.time_base or 0), stream.frames
-        is_raw = container.format.name in _RAW
+        is_raw = kind in _RAW
     if is_raw or any(packet.is_guessed for packet in stored):
         return _scan_in_order(path, len(stored), Fraction(1) if is_raw else tick_s)
     whole = [packet for packet in stored if packet.position not in lost]
