@@ -335,7 +335,7 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
     container, stream = open_container(path)
     with container:
         codec, kind = stream.codec_context.codec.canonical_name, container.format.name
-        reorders = kind == "mxf" and bool(stream.codec_context.has_b_frames)
+        reorders = kind in {"mxf", "asf"} and bool(stream.codec_context.has_b_frames)
         lengths = _bytes_of_lengths(codec, stream.codec_context.extradata or b"")
         stored = [
             _CodedFrame(
@@ -343,9 +343,11 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
                 packet.pts,
                 packet.is_keyframe,
                 _is_sound(packet, codec, lengths),
-                # AVI has stamps of decoding alone, and so does MXF without an index.
+                # AVI, ASF and MXF without an index have stamps of decoding alone, MPEG-PS some.
                 (codec == "mpeg4" and packet.size < _NVOP_BYTES)
-                or (reorders if packet.pts == packet.dts else kind == "avi"),
+                or (kind == "avi" and packet.pts != packet.dts)
+                or (kind in {"mpeg", "mpegts"} and packet.pts is None)
+                or reorders,
             )
             for packet in packets(container, stream)
             if not packet.is_discard and is_shown(packet, codec)
@@ -410,10 +412,19 @@ def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
         unseen = int(numbers[-1]) + 1 - len(found) + min(found) + stored - 1 - max(found)
         return _Scan(numbers, tick_s, [], {_NOT_GIVEN: unseen} if unseen else {}, True, True)
     # As FFmpeg does: where the stamps of showing go back, those of decoding count.
-    by_pts = np.array([-1 if pts is None else pts for pts, _ in shown], np.int64)
-    by_dts = np.array([-1 if dts is None else dts for _, dts in shown], np.int64)
-    ticks, count = by_pts if (np.diff(by_pts) > 0).all() else by_dts, np.arange(len(shown))
-    return _Scan(np.maximum.accumulate(ticks - count) + count, tick_s, [], {}, False, True)
+    by_pts, by_dts = (
+        np.array([np.nan if t is None else t for t in each]) for each in zip(*shown, strict=True)
+    )
+    stamps = by_pts if (np.diff(by_pts[~np.isnan(by_pts)]) > 0).all() else by_dts
+    (known,), count = np.nonzero(~np.isnan(stamps)), np.arange(len(stamps))
+    if not len(known):
+        raise damaged(path, "its frames bear no time stamps")
+    step = (stamps[known[-1]] - stamps[known[0]]) / max(int(known[-1] - known[0]), 1) or 1.0
+    beyond = np.where(count < known[0], count - known[0], np.maximum(count - known[-1], 0))
+    ticks = np.rint(np.interp(count, known, stamps[known]) + beyond * step).astype(np.int64)
+    unseen = stored - len(shown) if codec != "mpeg4" else 0  # whose packets are no pictures
+    dropped = {_NOT_GIVEN: unseen} if unseen > 0 else {}
+    return _Scan(np.maximum.accumulate(ticks - count) + count, tick_s, [], dropped, False, True)
 
 
 def _key_frames(ticks: Int64, keys: Int64) -> list[int]:
