@@ -417,6 +417,8 @@ def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
     )
     stamps = by_pts if (np.diff(by_pts[~np.isnan(by_pts)]) > 0).all() else by_dts
     (known,), count = np.nonzero(~np.isnan(stamps)), np.arange(len(stamps))
+    if not len(known) and stream.average_rate and tick_s:  # MXF that is cut off
+        stamps, known = count / float(stream.average_rate * tick_s), count
     if not len(known):
         raise damaged(path, "its frames bear no time stamps")
     step = (stamps[known[-1]] - stamps[known[0]]) / max(int(known[-1] - known[0]), 1) or 1.0
