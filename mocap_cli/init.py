@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import Shown, any_path, example_option, output_options, overwrite_option
+from mocap_cli.options import Shown, any_path, output_options, overwrite_option
 from mocap_cli.terminal import one_line, print_json, say, say_next, watching
 
 # More files of one kind in one folder are counted instead of listed.
@@ -14,8 +14,7 @@ _MANY = 5
 
 
 @click.command("init", short_help="Draft a flight.yaml from the files of a flight.")
-@click.argument("paths", type=any_path, nargs=-1, metavar="PATHS...")
-@example_option("Write an example flight with its flight.yaml, without videos, into a folder of this name.")
+@click.argument("paths", type=any_path, nargs=-1, required=True, metavar="PATHS...")
 @click.option(
     "-o",
     "--output",
@@ -24,9 +23,7 @@ _MANY = 5
 )
 @overwrite_option
 @output_options
-def init_command(
-    paths: tuple[Path, ...], example: str | None, output: Path | None, overwrite: bool, shown: Shown
-) -> None:
+def init_command(paths: tuple[Path, ...], output: Path | None, overwrite: bool, shown: Shown) -> None:
     """Look into logs, videos, keypoints, calibrations and maps, and draft the flight.yaml that names them.
 
     PATHS are files and folders; folders are searched. Names (drone1.mp4, drone1_poses.tum, /drone1/odometry,
@@ -34,11 +31,6 @@ def init_command(
     frame rate, a clock or a mount, is assumed and marked with `assumed: true`, or named as missing. Read the
     manifest before you ingest it. Without any camera, the exit status is 1.
     """
-    if bool(paths) == bool(example):
-        raise click.UsageError("State the files of a flight, or --example NAME.")
-    if example is not None:
-        _write_example(example, output, overwrite, shown)
-        return
     from pipelines.draft import draft
     from pipelines.ingest import OF_ONE_CAMERA
     from pipelines.session.storage import jsonable
@@ -70,24 +62,6 @@ def init_command(
             say_next(f"{first}mocap check {{}}", _from_here(result.path), shown.quiet)
     if not result.cameras:
         raise SystemExit(1)
-
-
-def _write_example(name: str, output: Path | None, overwrite: bool, shown: Shown) -> None:
-    from pipelines.simulate import example_scenario, simulate
-
-    if output is not None:
-        raise click.UsageError("--output is not used with --example: the flight is written to ./NAME.")
-    with watching(shown.level) as progress:
-        result = simulate(
-            example_scenario(name), Path(name), video=False, overwrite=overwrite, progress=progress
-        )
-    if shown.as_json:
-        print_json({"flight": str(result.folder / "flight.yaml"), "cameras": list(result.summary["frames"])})
-        return
-    if not shown.quiet:
-        say("simulated; its keypoints have the measured errors of a detector")
-    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'flight.yaml'}")
-    say_next("mocap run {}", result.folder / "flight.yaml", shown.quiet)
 
 
 def _from_here(path: Path) -> Path:

@@ -149,11 +149,6 @@ def workers_option(help_text: str) -> Callable[[Command], Command]:
     )
 
 
-def example_option(help_text: str) -> Callable[[Command], Command]:
-    """Make the option --example, the name of a scenario that is installed with the program."""
-    return click.option("--example", type=click.Choice(["mound_walk"]), help=help_text)
-
-
 class FiniteRange(click.FloatRange):
     """A range of numbers that refuses NaN and infinity, which click accepts."""
 

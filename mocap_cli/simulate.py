@@ -7,7 +7,6 @@ import click
 from mocap_cli.options import (
     Shown,
     any_path,
-    example_option,
     force_option,
     output_options,
     overwrite_option,
@@ -18,7 +17,11 @@ from mocap_cli.terminal import print_json, print_table, say, say_next, watching
 
 @click.command("simulate", short_help="Make a flight with known truth.")
 @click.argument("scenario", type=any_path, required=False, metavar="[SCENARIO.yaml]")
-@example_option("Simulate the scenario of the sample flight instead of one of yours.")
+@click.option(
+    "--example",
+    type=click.Choice(["mound_walk"]),
+    help="Simulate the scenario of the sample flight instead of one of yours.",
+)
 @click.option("-o", "--output", type=any_path, required=True, help="Folder of the flight.")
 @click.option(
     "--no-video",

@@ -12,7 +12,7 @@ from pipelines.draft import Drafted, draft
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
-from tests.commands.runner import content, mocap, refused, result_of, succeeds
+from tests.commands.runner import content, mocap, refused, succeeds
 from tests.real_data import real_data
 from tests.synthetic.flights import LENS, START_NS, SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import LEVER_ARM, header, write_logged_flight
@@ -297,11 +297,3 @@ def test_a_real_recording_of_four_cameras_needs_nothing_more(tmp_path: Path) -> 
     assert {path.name for path in result.left_out} == {"Config.toml", "LICENSE", "Calib.qca.txt"}
     done = ingest(result.path)
     assert [camera.frames.count for camera in done.description.cameras.values()] == [100] * 4
-
-
-def test_an_example_flight_needs_no_files_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    written = result_of("init", "--example", "mound_walk")
-    assert read_flight(tmp_path / written["flight"]).name == "Mound walk"
-    assert mocap("init").returncode == 2
-    assert mocap("init", "--example", "mound_walk", ".").returncode == 2
