@@ -342,7 +342,8 @@ def method_used(
     used["ground"] = {"cameras": list(ground["moved_m"]), "reasons": ground["reasons"]}
     offsets_s = metrics.get("clock_offsets_s") or {}
     sigmas_s = metrics.get("clock_offset_sigmas_s") or {}
-    clocks_s = {name: (offsets_s[name], sigma_s) for name, sigma_s in sigmas_s.items() if sigma_s > 0}
+    # What nothing shows stays at exactly 0.
+    clocks_s = {name: (offset_s, sigmas_s[name]) for name, offset_s in offsets_s.items() if offset_s != 0}
     refinement = metrics.get("refinement")
     absent = "robust fits calibrated still cameras better" if method == "auto" else "the method has none"
     reason = absent if refinement is None else refinement["fallback"]
