@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -52,7 +52,7 @@ from pipelines.replan import (
     settings_by_name,
     settings_of,
 )
-from pipelines.reporting.studies import Row, draw, estimates, rows_csv
+from pipelines.reporting.studies import ENDS, Row, draw, estimates, rows_csv
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
@@ -94,7 +94,7 @@ from pipelines.simulation.walks import (
 )
 
 # It is raised whenever the same study gives other figures than before.
-_REVISION = 13
+_REVISION = 14
 # A study with more combinations would take days.
 _MAX_CELLS = 500
 _COMMA = r",(?![^\[]*\])"  # not between brackets
@@ -102,7 +102,7 @@ _RANGE = re.compile(r"(-?[0-9.]+):(-?[0-9.]+):([0-9.]+)")
 _MEASURED = (
     *("capped_mm", "mpjpe_mm", "pck150", "coverage", "mean_range_m", "mean_tilt_deg", "hidden_share"),
     *("blind_s", "path_m", "energy_kj", "min_clearance_m", "min_separation_m", "min_actor_distance_m"),
-    *("violations", "low_mm", "high_mm"),
+    *("violations", *chain(*ENDS.values())),
 )
 """Figures of a combination, in the rows of a study of a session."""
 _UNDIVIDED = ("config",)  # variables whose value may hold commas
@@ -492,8 +492,8 @@ def _over_walks(rows: Sequence[Row]) -> Row:
         known = [one[name] for one in rows if one[name] is not None]
         over = np.min if name.startswith("min_") else np.mean
         row[name] = float(over(known)) if known else None
-    found = mean_of_trials(np.array([one["capped_mm"] for one in rows]))
-    row["low_mm"], row["high_mm"] = (found and found["interval"]) or (None, None)
+    for name in ENDS:
+        row |= _ends(name, mean_of_trials(np.array([one[name] for one in rows if one[name] is not None])))
     row["violations"] = sum(one["violations"] for one in rows)
     return row
 
@@ -591,9 +591,11 @@ def _figures(
     scene: ReplayScene, cell: Mapping[str, Any], scores: dict[str, Any], capped: np.ndarray[Any, Any]
 ) -> Row:
     errors = scores["reconstruction_error"]
-    estimate = mean_of_trials(capped)
-    low, high = estimate["interval"] if estimate is not None and estimate["interval"] else (None, None)
-    mpjpe, share, covered = (errors[key] for key in ("mpjpe_mm", "pck150", "coverage"))
+    found = {"capped_mm": mean_of_trials(capped), **errors}
+    figures: Row = {}
+    for name in ENDS:
+        figures[name] = found[name] and found[name]["mean"]
+        figures |= _ends(name, found[name])
     return {
         "arm": cell["arm"],
         **({"actor": cell["actor"]} if "actor" in cell else {}),
@@ -603,12 +605,7 @@ def _figures(
         **{name: value for name, value in cell.items() if name not in _SessionStudy.model_fields},
         "best": False,
         "tradeoff": False,
-        "capped_mm": None if estimate is None else estimate["mean"],
-        "low_mm": low,
-        "high_mm": high,
-        "mpjpe_mm": None if mpjpe is None else mpjpe["mean"],
-        "pck150": None if share is None else share["mean"],
-        "coverage": None if covered is None else covered["mean"],
+        **figures,
         "mean_range_m": scores["range_m"]["mean"],
         "mean_tilt_deg": scores["tilt_deg"]["mean"],
         "hidden_share": scores["occluded_share"],
@@ -620,6 +617,12 @@ def _figures(
         "min_actor_distance_m": scores["min_actor_distance_m"],
         "violations": sum(scores["limit_violations"].values()),
     }
+
+
+def _ends(name: str, found: Mapping[str, Any] | None) -> Row:
+    """Return the columns of the ends of a figure's interval; None where there is none."""
+    ends = (found and found["interval"]) or (None, None)
+    return dict(zip(ENDS[name], ends, strict=True))
 
 
 def _condition(row: Row) -> str:
@@ -666,12 +669,14 @@ def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], cells: Seq
 def _verdict(rows: Sequence[Row], best: Mapping[str, Any]) -> str:
     own, group = rows[best["cell"]], [rows[k] for k in best["cells"]]
     ends = "" if own["low_mm"] is None else f" [{own['low_mm']:.1f}, {own['high_mm']:.1f}]"
+    low, high = (own[end] for end in ENDS["pck150"])
+    right = "" if low is None else f" [{100 * low:.1f}, {100 * high:.1f}]"
     under = f"With {condition} " if (condition := _condition(own)) else ""
     winner = "best is " if not best["alike"] else "least error has "
     winner = winner if len(group) > 1 else ""
     words = [
         f"{under}{winner}{_named(own)}: {own['capped_mm']:.1f}{ends} mm over all joints,"
-        f" {100 * own['pck150']:.1f} % within 150 mm,"
+        f" {100 * own['pck150']:.1f}{right} % within 150 mm,"
         f" {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
     ]
     if best["alike"]:

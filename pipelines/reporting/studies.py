@@ -69,6 +69,11 @@ _COLUMNS = {
     "min_separation_m": "separation m",
     "violations": "violations",
 }
+ENDS = {
+    "capped_mm": ("low_mm", "high_mm"),
+    **{name: (f"{name}_low", f"{name}_high") for name in ("mpjpe_mm", "pck150", "coverage")},
+}
+"""The columns of the ends of an interval, by the column of its mean, in a study of a session."""
 _ALIKE = {"robots": "{} drones", "tilt_deg": "tilt {:g} deg", "range_m": "{:g} m"}  # said once if all have it
 _SHOWN = (METRICS["mpjpe_mm"], METRICS["reconstructed_share"])  # tables on a session's page
 
@@ -205,8 +210,9 @@ def _table_of_session(metrics: Mapping[str, Any]) -> StudyTable:
             if isinstance(value, float):
                 shown = f"{100 * value if name in percent else value:.1f}"
                 value = f"{value:g}" if name in names else shown
-            if name == "capped_mm" and cell["low_mm"] is not None:
-                value += f" ±{(cell['high_mm'] - cell['low_mm']) / 2:.1f}"
+            low, high = (cell.get(end) for end in ENDS.get(name, ("", "")))
+            if low is not None:
+                value += f" ±{(100 if name in percent else 1) * (high - low) / 2:.1f}"
             row.append("-" if value is None else str(value))
         row.insert(mark, "best" if cell["best"] else "trade-off" if cell["tradeoff"] else "")
         rows.append(row)
@@ -218,13 +224,11 @@ def _text(cell: Mapping[str, Any], name: str) -> str:
     estimate = cell["ratio"] if name == "ratio" else cell["metrics"][name]
     if estimate is None:
         return "-"
-    if name in _SHARES:
-        return f"{100 * estimate['mean']:.1f}"
-    digits = 2 if name == "ratio" else 1
-    text = f"{estimate['mean']:.{digits}f}"
+    scale, digits = 100 if name in _SHARES else 1, 2 if name == "ratio" else 1
+    text = f"{scale * estimate['mean']:.{digits}f}"
     if estimate["interval"] is None:
         return text
-    low, high = estimate["interval"]
+    low, high = (scale * end for end in estimate["interval"])
     return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
