@@ -19,6 +19,7 @@ $(STAMP): requirements.lock pyproject.toml
 	touch $(STAMP)
 
 demo: setup
+	@echo "The sample flight takes some five minutes. mocap is $(BIN)/mocap."
 	mkdir -p $(DEMO)
 	$(BIN)/mocap models fetch blazepose
 	$(BIN)/mocap ingest sample_data/mound_walk/flight.yaml -o $(DEMO)/mound_walk.session
