@@ -14,3 +14,6 @@ import zlib as _zlib  # noqa: F401
 # give the same bytes. So linear algebra has one thread, whatever the user has set. Callers share out work.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
     _os.environ[_name] = "1"
+
+# numba colours the message of every type that it tries in vain, which takes 6 % of the time to compile.
+_os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")

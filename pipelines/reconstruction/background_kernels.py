@@ -187,8 +187,10 @@ def eliminate_points(
                         band[at + k, i - k] += share * by_pose[a, k]
         # Whitened: mixed F^-T, and F^-1 pull.
         forward(normal, pull)
-        kept[n, :9] = normal.copy().reshape(9)
-        kept[n, 9:12] = pull
+        for i in range(3):
+            kept[n, 9 + i] = pull[i]
+            for k in range(3):
+                kept[n, 3 * i + k] = normal[i, k]
         for s in range(start, stop):
             mixed = half[s - start]
             at = offset[seen.picture[s]]
@@ -222,6 +224,7 @@ def move_points(
     step: Float,
 ) -> None:
     """Move the points by what the step [n] of the poses leaves to them; `kept` is of `eliminate_points`."""
+    factor = np.zeros((3, 3))
     for n in range(len(seen.first) - 1):
         force = np.zeros(3)
         for s in range(seen.first[n], seen.first[n + 1]):
@@ -237,7 +240,9 @@ def move_points(
                     along += by_pose[a, i] * step[offset[t] + i]
                 for i in range(3):
                     force[i] -= weight * by_point[a, i] * along
-        factor = kept[n, :9].copy().reshape(3, 3)
+        for i in range(3):
+            for k in range(3):
+                factor[i, k] = kept[n, 3 * i + k]
         forward(factor, force)
         for i in range(3):
             force[i] += kept[n, 9 + i]  # the points' own part is kept whitened

@@ -358,8 +358,9 @@ def forwards(
     s = size - 3 * n - 2 * c
     lengths = shared[len(shared) - len(bones) :]
     length_offset = size - len(bones)
+    kept, variance = sweep.tie_kept, sweep.tie_variance
     if c and first == 0:
-        tie_knots(front, gradient, n, c, knots, 0, sweep)
+        tie_knots(front, gradient, n, c, knots, interval, kept, variance)
     own, beside = np.empty((n, n)), np.empty((size - n, n))
     knot_own, knot_beside = np.empty((c, c)), np.empty((2 * n + c + s, c))
     for time in range(first, last + 1):
@@ -370,7 +371,7 @@ def forwards(
                 factors.knot_across[k], factors.knot_solved[k],
             )  # fmt: skip
             interval += 1
-            tie_knots(front, gradient, n, c, knots, interval, sweep)
+            tie_knots(front, gradient, n, c, knots, interval, kept, variance)
         if time == last:
             break
         assemble(starts[time], starts[time + 1], sweep.equations, front, gradient)
@@ -472,12 +473,19 @@ def eliminate_knot(
 
 @helper
 def tie_knots(
-    front: Float, gradient: Float, n: int, c: int, knots: Float, interval: int, sweep: Sweep
+    front: Float,
+    gradient: Float,
+    n: int,
+    c: int,
+    knots: Float,
+    interval: int,
+    tie_kept: Float,
+    tie_variance: Float,
 ) -> None:
     """Add the prior of the change between the knot before and the knot after."""
     before, after = 3 * n, 3 * n + c
     for i in range(c):
-        kept, q = sweep.tie_kept[interval, i], sweep.tie_variance[interval, i]
+        kept, q = tie_kept[interval, i], tie_variance[interval, i]
         change = knots[interval + 1, i] - kept * knots[interval, i]
         front[before + i, before + i] += kept * kept / q
         front[after + i, after + i] += 1 / q
