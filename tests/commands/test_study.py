@@ -247,6 +247,8 @@ def test_a_verdict_says_in_how_many_other_walks_it_holds(calm: Path, tmp_path: P
     assert (metrics["walks"], len(metrics["cells"]), best["cell"]) == (3, 2, 0)
     assert best["walks"][1] == {"better": 3, "worse": 0, "walks": 3}
     assert "3 of 3" in metrics["verdict"]
+    near = metrics["cells"][0]
+    assert all(near[f"{name}_low"] < near[name] < near[f"{name}_high"] for name in ("mpjpe_mm", "pck150"))
     with (tmp_path / "out" / "table.csv").open(encoding="utf-8") as file:
         paths = {row["actor"]: row["path_m"] for row in csv.DictReader(file) if float(row["range_m"]) == 8}
     assert len(set(paths.values())) == 3
