@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from pipelines.reconstruct import Reconstructed, ReconstructSettings
 
 
-# Further reasons stand in metrics.json, and as warnings; the page shows as many.
-MAX_REASONS = 3
+# Further reasons stand in metrics.json, and as warnings.
+_MAX_REASONS = 3
 
 
 class People(click.ParamType["int | str"]):
@@ -187,7 +187,7 @@ def print_verdict(verdict: dict[str, Any], session: Path, flight: Path | None = 
         would = "without these doubts the error would be" if verdict["grade"] == "wrong" else "the error is"
         error = f"{would} about {median:.0f} mm, in 4 of 5 flights {low:.0f} to {high:.0f} mm"
     say(f"{verdict['grade']}: {error}")
-    for reason in verdict["why"][:MAX_REASONS]:
+    for reason in verdict["why"][:_MAX_REASONS]:
         say(f"  {reason}")
     follows = verdict["next"]
     if flight is None or "SESSION" in follows:

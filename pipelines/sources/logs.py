@@ -3,7 +3,6 @@
 If no topic is stated, the only candidate of its kind is taken, and a note names it.
 """
 
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -54,7 +53,7 @@ MAX_KEPT_MESSAGES = 4_000_000
 MAX_KEPT_FILES = 64
 
 # Foxglove's and ffmpeg_image_transport's packets need those before them.
-_CODED_VIDEO = re.compile(r"CompressedVideo$|FFMPEGPacket$")
+_CODED_VIDEO = ("CompressedVideo", "FFMPEGPacket")
 
 _NOUNS: dict[Kind, str] = {
     "poses": "poses",
@@ -107,7 +106,7 @@ class FlightLog:
             type_ = self.type_of(topic)
             problem = f"topic {topic} holds {type_}, no {noun}" if type_ else f"has no topic {topic}"
             remedy = f"topics with {noun}: {listed}"
-            if type_ is not None and _CODED_VIDEO.search(type_):
+            if type_ and type_.endswith(_CODED_VIDEO) and noun == _NOUNS["pictures"]:
                 problem = f"topic {topic} holds coded video ({type_}), which is not read from logs"
                 remedy = "write its stream to a .h264 file, and its stamps to a CSV for frame_times"
             if type_ in FIXES and noun == _NOUNS["poses"]:

@@ -126,7 +126,7 @@ def _columns(text: str) -> tuple[Heading, dict[str, int], list[float], bool] | N
 def _read_table(path: Path) -> tuple[Int64, Bool, Float, bool]:
     """Read a table whose heading names a time and places, separated by commas, semicolons or tabs.
 
-    A date in a column of its own stands before the time of the day.
+    A date in a column of its own belongs to the time of the day, not to other times.
     """
     text = read_text(path)
     found = _columns(text)
@@ -138,7 +138,9 @@ def _read_table(path: Path) -> tuple[Int64, Bool, Float, bool]:
     table = rows_below(path, heading, text, dated, columns)
     stamps = table.text["stamp"]
     if dated:
-        stamps = pc.binary_join_element_wise(table.text["date"], stamps, " ")
+        dates, stamps = (pc.utf8_trim_whitespace(each) for each in (table.text["date"], stamps))
+        joined = pc.binary_join_element_wise(dates, stamps, " ")
+        stamps = pc.if_else(pc.match_substring_regex(stamps, r"^\d{1,2}:"), joined, stamps)
     t_ns, timed = parse_stamps(path, stamps, heading.unit, unit_stated=heading.unit_stated)
     return t_ns, timed, table.stack([*columns]) * units, on_earth
 

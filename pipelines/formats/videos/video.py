@@ -11,7 +11,7 @@ import bisect
 import re
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fractions import Fraction
 from functools import lru_cache
@@ -346,7 +346,7 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
                 # AVI, ASF and MXF without an index have stamps of decoding alone, MPEG-PS some.
                 (codec == "mpeg4" and packet.size < _NVOP_BYTES)
                 or (kind == "avi" and packet.pts != packet.dts)
-                or (kind in {"mpeg", "mpegts"} and packet.pts is None)
+                or (kind in {"mpeg", "mpegts", "mxf"} and packet.pts is None)
                 or reorders,
             )
             for packet in packets(container, stream)
@@ -357,7 +357,8 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
         tick_s, listed = Fraction(stream.time_base or 0), stream.frames
         is_raw = kind in _RAW
     if is_raw or any(packet.is_guessed for packet in stored):
-        return _scan_in_order(path, len(stored), Fraction(1) if is_raw else tick_s)
+        unsound = sum(not packet.sound for packet in stored)
+        return replace(_scan_in_order(path, len(stored), tick_s), damaged=unsound)
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
@@ -401,6 +402,7 @@ def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
     container, stream = open_container(path)
     with container:
         is_raw, codec = container.format.name in _RAW, stream.codec_context.codec.canonical_name
+        rate = stream.average_rate
         shown = [(frame.pts, frame.dts) for frame in _decoded(container, stream, None)]
     if not shown:
         raise _undecodable(path, stored)
@@ -410,15 +412,16 @@ def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
         with container:
             numbers = _numbers_by_order(found, _orders(packets(container, stream), codec, set(found)))
         unseen = int(numbers[-1]) + 1 - len(found) + min(found) + stored - 1 - max(found)
-        return _Scan(numbers, tick_s, [], {_NOT_GIVEN: unseen} if unseen else {}, True, True)
+        return _Scan(numbers, Fraction(1), [], {_NOT_GIVEN: unseen} if unseen else {}, True, True)
     # As FFmpeg does: where the stamps of showing go back, those of decoding count.
     by_pts, by_dts = (
         np.array([np.nan if t is None else t for t in each]) for each in zip(*shown, strict=True)
     )
-    stamps = by_pts if (np.diff(by_pts[~np.isnan(by_pts)]) > 0).all() else by_dts
+    by_pts_known = by_pts[~np.isnan(by_pts)]
+    stamps = by_pts if len(by_pts_known) and (np.diff(by_pts_known) > 0).all() else by_dts
     (known,), count = np.nonzero(~np.isnan(stamps)), np.arange(len(stamps))
-    if not len(known) and stream.average_rate and tick_s:  # MXF that is cut off
-        stamps, known = count / float(stream.average_rate * tick_s), count
+    if not len(known) and rate and tick_s:  # MXF that is cut off
+        stamps, known = count / float(rate * tick_s), count
     if not len(known):
         raise damaged(path, "its frames bear no time stamps")
     step = (stamps[known[-1]] - stamps[known[0]]) / max(int(known[-1] - known[0]), 1) or 1.0
@@ -495,7 +498,8 @@ def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
         ends_ns = np.append(pts_ns[starts], pts_ns[-1] + step_ns)
         pts_ns = np.interp(np.arange(len(pts_ns)), np.append(starts, len(pts_ns)), ends_ns).astype(np.int64)
         notes = (f"{again} frames have the stamp of the frame before: spread up to the next stamp",)
-    if scan.is_raw:
+    codec = stream.codec_context.codec.canonical_name
+    if scan.is_raw and codec != "mjpeg":
         notes += (
             "a raw stream has no times: lost pictures are counted by what the others say of their order,"
             " which may be wrong next to a key frame",
@@ -511,7 +515,7 @@ def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
         width=width,
         height=height,
         rotation_deg=turned,
-        codec=UNTIMED if scan.is_raw else stream.codec_context.codec.canonical_name,
+        codec=UNTIMED if scan.is_raw else codec,
         dropped=scan.dropped,
         notes=notes,
     )
@@ -554,6 +558,12 @@ class _Bits:
         while not self.read(1):
             zeros += 1
         return (1 << zeros) - 1 + self.read(zeros)
+
+    def width(self) -> int:
+        """Read how many bits a count has; no standard allows more than 16."""
+        if (above := self.golomb()) > 12:
+            raise ValueError
+        return above + 4
 
 
 # Profiles of H.264 that state their chroma and scaling lists (ITU-T H.264, 7.3.2.1.1).
@@ -652,9 +662,9 @@ class _H264Head:
                         code = bits.golomb()
                         following = (last + (code + 1) // 2 * (1 if code % 2 else -1)) % 256
                     last = following or last
-        frame_bits, order_kind, order_bits = bits.golomb() + 4, bits.golomb(), 0
+        frame_bits, order_kind, order_bits = bits.width(), bits.golomb(), 0
         if order_kind == 0:
-            order_bits = bits.golomb() + 4
+            order_bits = bits.width()
         elif order_kind == 1:
             bits.read(1), bits.golomb(), bits.golomb()
             for _ in range(bits.golomb()):
@@ -701,15 +711,12 @@ class _H265Head:
         for _ in range(4 if bits.read(1) else 0):
             bits.golomb()
         bits.golomb(), bits.golomb()
-        self._streams[name] = bits.golomb() + 4, planes
+        self._streams[name] = bits.width(), planes
 
 
 def _units(packet: bytes) -> Iterator[bytes]:
-    """Yield the beginnings of the units of a packet, without start codes."""
-    for code in re.finditer(b"\0\0\1", packet):
-        unit = packet[code.end() : code.end() + _HEADER_BYTES]
-        if len(unit) > 2:
-            yield unit.split(b"\0\0\1")[0]
+    """Return the beginnings of the units of a packet, without start codes."""
+    return (unit[:_HEADER_BYTES] for unit in packet.split(b"\0\0\1")[1:] if len(unit) > 2)
 
 
 def _numbers_by_order(found: list[int], orders: dict[int, _Order]) -> Int64:
@@ -737,12 +744,12 @@ def _numbers_by_order(found: list[int], orders: dict[int, _Order]) -> Int64:
         round((max(counts) - min(counts)) / step) + 1 + unplaced[sequence]
         for sequence, counts in sequences.items()
     ]
-    inner, usual = lengths[:-1], max(lengths, default=0)
+    inner, usual = lengths[:-1], max(lengths)
     if 2 * lengths.count(usual) > len(inner) > 0 and min(inner) >= usual - _MOST_LOST:
         lengths = [usual] * len(inner)
-    begins = np.cumsum([0, *lengths])
+    begins = dict(zip(sequences, np.cumsum([0, *lengths]).tolist(), strict=False))
     taken = [
-        int(begins[orders[number].sequence]) + round((place - min(sequences[orders[number].sequence])) / step)
+        begins[orders[number].sequence] + round((place - min(sequences[orders[number].sequence])) / step)
         for number, place in zip(found, places, strict=True)
         if place is not None
     ]
@@ -750,8 +757,8 @@ def _numbers_by_order(found: list[int], orders: dict[int, _Order]) -> Int64:
     # A decoder that misses a key frame mixes the pictures around it.
     numbers: Int64 = np.maximum.accumulate(np.sort(np.array(taken, np.int64)) - count) + count
     numbers -= numbers[0]
-    # More pictures lost than given are rather damaged headers.
-    return numbers if numbers[-1] < 2 * len(found) + _NEAR else by_packets
+    # More pictures lost than stored are rather damaged headers.
+    return numbers if numbers[-1] < 2 * len(orders) + _NEAR else by_packets
 
 
 # --- decoding -----------------------------------------------------------------------------------------
