@@ -405,22 +405,23 @@ def summary(
 
 
 def special_table(chosen: Sequence[Flight], found: Mapping[Case, Outcome]) -> list[str]:
-    """Write a line for each special case: what `auto` loses without it, and the flight that it helps most."""
-    rows = []
+    """Write what `auto` loses without each special case, in the mean and on the flight that it helps most."""
+    alike: dict[tuple[str, ...], list[str]] = {}  # of many nothing changes
     for case in SPECIAL:
-        rows.append([case])
+        row = []
         for given in GIVEN:
-            change, nees_of = {}, []
+            change = []
             for flight in chosen:
                 without, whole = (_of(flight, method, given, found) for method in (case, "auto"))
-                change[flight.name] = 100 * (_mean(without, "mpjpe_mm") / _mean(whole, "mpjpe_mm") - 1)
-                nees_of.append(_mean(without, "nees"))
-            most = max(change, key=lambda name: (np.isnan(change[name]), change[name]))
-            worst = "nothing left" if np.isnan(change[most]) else f"{change[most]:+.0f}"
-            mean = np.nanmean(list(change.values()))
-            rows[-1] += [f"{mean:+.1f} ({worst}, {most})", fixed(float(np.nanmean(nees_of)), 1)]
-    names = [f"{said}: {name}" for said in ("stated", "not stated") for name in ("MPJPE % (most)", "NEES")]
-    return markdown_table(["`auto` without", *names], rows)
+                change.append(100 * (_mean(without, "mpjpe_mm") / _mean(whole, "mpjpe_mm") - 1))
+            row.append(
+                f"{np.nanmean(change):+.1f} ({'lost' if np.isnan(change).any() else f'{max(change):+.0f}'})"
+            )
+        alike.setdefault(tuple(row), []).append(case)
+    rows = [[", ".join(cases), *row] for row, cases in alike.items()]
+    return markdown_table(
+        ["`auto` without", *(f"MPJPE %, {said} (most)" for said in ("stated", "not stated"))], sorted(rows)
+    )
 
 
 _COLUMNS = (

@@ -60,10 +60,10 @@ SECTIONS = (
         " cameras share cannot be seen in pictures: it bounds what any method reaches. NEES of 3 is right.",
         (
             Part("sample-poses", "The sample flight", RENDERED, TUNED),
-            Part("corpus-model", "The corpus, pose noise stated", RENDERED, "each half by its name"),
-            Part("corpus-nothing", "The corpus, pose noise not stated", RENDERED, "each half by its name"),
-            Part("corpus-special", "`auto` without each of its special cases", RENDERED, "kept aside"),
+            Part("corpus-model", "The corpus, pose noise stated", RENDERED, KEPT),
+            Part("corpus-nothing", "The corpus, pose noise not stated", RENDERED, KEPT),
             Part("angles", "Joint angles", RENDERED, KEPT),
+            Part("corpus-special", "`auto` without each of its special cases", RENDERED, KEPT),
             Part("bodies", "Bodies with a surface, one draw, noise stated", RENDERED, KEPT),
         ),
     ),
@@ -178,13 +178,14 @@ def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
         "# Results",
         "",
         *_words(
-            "All figures of this project, each table with its kind, its command, its date and its commit."
+            "All figures of this project, each table with kind, command (or that above), date and commit."
             " `python -m benchmarks.results` measures the sample again and writes this page; the other"
             " commands replace their tables with `--write`. Constants were tuned on flights that are"
             " called so; no constant was chosen because of those kept aside. Closed loops of planners"
             " amplify rounding: other processors change their figures by up to 8 %."
         ),
     ]
+    before = ""  # the command of the table above, which is not repeated
     for section in SECTIONS:
         measured = [part for part in section.parts if part.key in stored]
         lines += [f"## {section.title}", "", *_words(section.words)] if measured else []
@@ -192,8 +193,10 @@ def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
             one = stored[part.key]
             kind = ", ".join(filter(None, (part.kind, part.halves)))
             lines += [f"**{part.title}** ({kind}; {one['date']}, {one['commit']})", ""]
-            lines += [f"    {command}" for command in one["command"].splitlines()]
-            lines += ["", *one["lines"], ""]
+            new = one["command"] != before
+            lines += [*(f"    {command}" for command in one["command"].splitlines() if new), *[""] * new]
+            lines += [*one["lines"], ""]
+            before = one["command"]
     return "\n".join(lines).rstrip() + "\n"
 
 
