@@ -31,7 +31,7 @@ def _seconds_of(date: str) -> str:
         moment = datetime.fromisoformat(date)
     except ValueError:
         return ", such as 1700000000.25 since 1970 or 12.5 since a log's start"
-    return f": {date} is {(moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp():.3f}"
+    return f": {date} is {(moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp():.6f}"
 
 
 SecondsAsNs = Annotated[int, BeforeValidator(nanoseconds)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections import Counter
@@ -186,7 +187,10 @@ class KeypointFile:
     def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
         """Read every person; pixels and scores as the file has them, cleaned by `Gathering.detections`."""
         people = Gathering(path)
-        self.gather(people)
+        try:
+            self.gather(people)
+        except csv.Error as error:  # most often a cell of more than 131072 characters
+            raise damaged(path, error) from error
         people.leave_out_face_and_hands()
         return people.detections(_choose_skeleton(people, skeleton), first_frame)
 

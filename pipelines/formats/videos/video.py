@@ -412,7 +412,9 @@ def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
         with container:
             numbers = _numbers_by_order(found, _orders(packets(container, stream), codec, set(found)))
         unseen = int(numbers[-1]) + 1 - len(found) + min(found) + stored - 1 - max(found)
-        return _Scan(numbers, Fraction(1), [], {_NOT_GIVEN: unseen} if unseen else {}, True, True)
+        return _Scan(
+            numbers, Fraction(1), [], {_NOT_GIVEN: unseen} if unseen else {}, is_raw=True, in_order=True
+        )
     # As FFmpeg does: where the stamps of showing go back, those of decoding count.
     by_pts, by_dts = (
         np.array([np.nan if t is None else t for t in each]) for each in zip(*shown, strict=True)
@@ -429,7 +431,7 @@ def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
     ticks = np.rint(np.interp(count, known, stamps[known]) + beyond * step).astype(np.int64)
     unseen = stored - len(shown) if codec != "mpeg4" else 0  # whose packets are no pictures
     dropped = {_NOT_GIVEN: unseen} if unseen > 0 else {}
-    return _Scan(np.maximum.accumulate(ticks - count) + count, tick_s, [], dropped, False, True)
+    return _Scan(np.maximum.accumulate(ticks - count) + count, tick_s, [], dropped, in_order=True)
 
 
 def _key_frames(ticks: Int64, keys: Int64) -> list[int]:
@@ -570,22 +572,23 @@ class _Bits:
 _HIGH_PROFILES = {44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244}
 # A picture that no decoder gives is at most so many counts from the one before it.
 _NEAR = 32
+# Parameter sets by their numbers, as far as the headers of pictures need them.
+_Sets = dict[int, tuple[int, ...]]
 # No header of a picture or a stream is longer, even with all scaling lists.
 _HEADER_BYTES = 1024
 
 
 def _orders(coded: Iterator[Packet[VideoStream]], codec: str, given: set[int]) -> dict[int, _Order]:
     """Read the place of each coded picture in the order of showing, by number of packet, from its header."""
-    head = _H264Head() if codec == "h264" else _H265Head() if codec == "hevc" else None
-    if head is None:
-        return {}
     orders: dict[int, _Order] = {}
+    streams: _Sets = {}
+    pictures: _Sets = {}
     sequence, is_whole, reference = -1, False, 0
     seen: set[int] = set()
     for number, packet in enumerate(coded):
         try:
-            found = head.read(bytes(packet))
-        except (ValueError, KeyError):
+            found = _HEADS[codec](bytes(packet), streams, pictures)
+        except (ValueError, KeyError):  # a damaged header, or MJPEG, which has none
             found = None
         if found is None or (found.is_field and number not in given):
             continue
@@ -618,100 +621,92 @@ class _Coded(NamedTuple):
     is_field: bool = False
 
 
-class _H264Head:
-    """Reader of H.264's headers, which keeps the parameter sets."""
-
-    def __init__(self) -> None:
-        self._streams: dict[int, tuple[int, int, bool, bool]] = {}
-        self._pictures: dict[int, int] = {}
-
-    def read(self, packet: bytes) -> _Coded | None:
-        """Read the units of a packet up to its first slice; None without one (ITU-T H.264, 7.3)."""
-        for unit in _units(packet):
-            kind, bits = unit[0] & 31, _Bits(unit[1:])
-            if kind == 7:
-                self._read_stream(bits)
-            elif kind == 8:
-                self._pictures[bits.golomb()] = bits.golomb()
-            elif kind in {1, 5}:
-                bits.golomb(), bits.golomb()
-                frame_bits, order_bits, planes, fields = self._streams[self._pictures[bits.golomb()]]
-                bits.read(2 * planes)
-                number = bits.read(frame_bits)
-                if is_field := bool(fields and bits.read(1)):
-                    bits.read(1)
-                if kind == 5:
-                    bits.golomb()
-                is_reference = bool(unit[0] & 0x60)
-                place = bits.read(order_bits) if order_bits else 2 * number - (not is_reference)
-                modulus = 1 << order_bits if order_bits else 2 << frame_bits
-                return _Coded(kind == 5, is_reference, place, modulus, is_field)
-        return None
-
-    def _read_stream(self, bits: _Bits) -> None:
-        profile, planes = bits.read(24) >> 16, False
-        name = bits.golomb()
-        if profile in _HIGH_PROFILES:
-            chroma = bits.golomb()
-            planes = chroma == 3 and bool(bits.read(1))
-            bits.golomb(), bits.golomb(), bits.read(1)
-            for k in range(12 if chroma == 3 else 8) if bits.read(1) else ():
-                last = following = 8
-                for _ in range((16 if k < 6 else 64) if bits.read(1) else 0):
-                    if following:
-                        code = bits.golomb()
-                        following = (last + (code + 1) // 2 * (1 if code % 2 else -1)) % 256
-                    last = following or last
-        frame_bits, order_kind, order_bits = bits.width(), bits.golomb(), 0
-        if order_kind == 0:
-            order_bits = bits.width()
-        elif order_kind == 1:
-            bits.read(1), bits.golomb(), bits.golomb()
-            for _ in range(bits.golomb()):
+def _h264_picture(packet: bytes, streams: _Sets, pictures: _Sets) -> _Coded | None:
+    """Read the units of a packet up to its first slice; None without one (ITU-T H.264, 7.3)."""
+    for unit in _units(packet):
+        kind, bits = unit[0] & 31, _Bits(unit[1:])
+        if kind == 7:  # sequence parameter set
+            _read_h264_stream(bits, streams)
+        elif kind == 8:  # picture parameter set
+            pictures[bits.golomb()] = (bits.golomb(),)
+        elif kind in {1, 5}:  # slice; 5: of a picture that refers to nothing before it
+            bits.golomb(), bits.golomb()
+            (stream,) = pictures[bits.golomb()]
+            frame_bits, order_bits, planes, fields = streams[stream]
+            bits.read(2 * planes)
+            number = bits.read(frame_bits)
+            if is_field := bool(fields and bits.read(1)):
+                bits.read(1)
+            if kind == 5:
                 bits.golomb()
-        bits.golomb(), bits.read(1), bits.golomb(), bits.golomb()
-        self._streams[name] = frame_bits, order_bits, planes, not bits.read(1)
+            is_reference = bool(unit[0] & 0x60)
+            place = bits.read(order_bits) if order_bits else 2 * number - (not is_reference)
+            modulus = 1 << order_bits if order_bits else 2 << frame_bits
+            return _Coded(kind == 5, is_reference, place, modulus, is_field)
+    return None
 
 
-class _H265Head:
-    """Reader of H.265's headers, which keeps the parameter sets."""
-
-    def __init__(self) -> None:
-        self._streams: dict[int, tuple[int, bool]] = {}
-        self._pictures: dict[int, tuple[int, int, int]] = {}
-
-    def read(self, packet: bytes) -> _Coded | None:
-        """Read the units of a packet up to its first slice; None without one (ITU-T H.265, 7.3)."""
-        for unit in _units(packet):
-            kind, bits = unit[0] >> 1 & 63, _Bits(unit[2:])
-            if kind == 33:
-                self._read_stream(bits)
-            elif kind == 34:
-                name, stream, shown = bits.golomb(), bits.golomb(), bits.read(2) & 1
-                self._pictures[name] = stream, shown, bits.read(3)
-            elif kind < 10 or 16 <= kind <= 21:
-                bits.read(2 if kind >= 16 else 1)
-                stream, shown, extra = self._pictures[bits.golomb()]
-                order_bits, planes = self._streams[stream]
-                bits.read(extra), bits.golomb(), bits.read(shown + 2 * planes)
-                low = 0 if kind in {19, 20} else bits.read(order_bits)
-                is_reference = unit[1] & 7 == 1 and (kind % 2 == 1 or kind >= 16) and kind not in {7, 9}
-                return _Coded(16 <= kind <= 20, is_reference, low, 1 << order_bits)
-        return None
-
-    def _read_stream(self, bits: _Bits) -> None:
-        layers = bits.read(7) & 7
-        bits.read(1 + 96)
-        flags = [bits.read(2) for _ in range(8 if layers else 0)][:layers]
-        for each in flags:
-            bits.read(88 * (each >> 1) + 8 * (each & 1))
-        name, chroma = bits.golomb(), bits.golomb()
+def _read_h264_stream(bits: _Bits, streams: _Sets) -> None:
+    profile, planes = bits.read(24) >> 16, False
+    name = bits.golomb()
+    if profile in _HIGH_PROFILES:
+        chroma = bits.golomb()
         planes = chroma == 3 and bool(bits.read(1))
-        bits.golomb(), bits.golomb()
-        for _ in range(4 if bits.read(1) else 0):
+        bits.golomb(), bits.golomb(), bits.read(1)
+        for k in range(12 if chroma == 3 else 8) if bits.read(1) else ():  # scaling lists
+            last = following = 8
+            for _ in range((16 if k < 6 else 64) if bits.read(1) else 0):
+                if following:
+                    code = bits.golomb()
+                    following = (last + (code + 1) // 2 * (1 if code % 2 else -1)) % 256
+                last = following or last
+    frame_bits, order_kind, order_bits = bits.width(), bits.golomb(), 0
+    if order_kind == 0:
+        order_bits = bits.width()
+    elif order_kind == 1:
+        bits.read(1), bits.golomb(), bits.golomb()
+        for _ in range(bits.golomb()):
             bits.golomb()
-        bits.golomb(), bits.golomb()
-        self._streams[name] = bits.width(), planes
+    bits.golomb(), bits.read(1), bits.golomb(), bits.golomb()
+    streams[name] = frame_bits, order_bits, planes, not bits.read(1)
+
+
+def _h265_picture(packet: bytes, streams: _Sets, pictures: _Sets) -> _Coded | None:
+    """Read the units of a packet up to its first slice; None without one (ITU-T H.265, 7.3)."""
+    for unit in _units(packet):
+        kind, bits = unit[0] >> 1 & 63, _Bits(unit[2:])
+        if kind == 33:  # sequence parameter set
+            _read_h265_stream(bits, streams)
+        elif kind == 34:  # picture parameter set
+            name, stream, shown = bits.golomb(), bits.golomb(), bits.read(2) & 1
+            pictures[name] = stream, shown, bits.read(3)
+        elif kind < 10 or 16 <= kind <= 21:  # slice; 16 to 21: of a picture at which decoding may begin
+            bits.read(2 if kind >= 16 else 1)
+            stream, shown, extra = pictures[bits.golomb()]
+            order_bits, planes = streams[stream]
+            bits.read(extra), bits.golomb(), bits.read(shown + 2 * planes)
+            low = 0 if kind in {19, 20} else bits.read(order_bits)
+            is_reference = unit[1] & 7 == 1 and (kind % 2 == 1 or kind >= 16) and kind not in {7, 9}
+            return _Coded(16 <= kind <= 20, is_reference, low, 1 << order_bits)
+    return None
+
+
+def _read_h265_stream(bits: _Bits, streams: _Sets) -> None:
+    layers = bits.read(7) & 7
+    bits.read(1 + 96)
+    flags = [bits.read(2) for _ in range(8 if layers else 0)][:layers]
+    for each in flags:
+        bits.read(88 * (each >> 1) + 8 * (each & 1))
+    name, chroma = bits.golomb(), bits.golomb()
+    planes = chroma == 3 and bool(bits.read(1))
+    bits.golomb(), bits.golomb()
+    for _ in range(4 if bits.read(1) else 0):
+        bits.golomb()
+    bits.golomb(), bits.golomb()
+    streams[name] = bits.width(), planes
+
+
+_HEADS = {"h264": _h264_picture, "hevc": _h265_picture}
 
 
 def _units(packet: bytes) -> Iterator[bytes]:

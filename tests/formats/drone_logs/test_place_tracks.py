@@ -47,6 +47,7 @@ def test_a_gpx_track_has_places_and_times(tmp_path: Path) -> None:
             True,
         ),
         ("date,time,East,North,Up,speed,heading\n2026-05-01,10:00:00,1,2,3,4,5\n", [[1, 2, 3]], False),
+        ("date,t,lat,lon,alt\n2026-05-01,7,47,8,4\n", [[47, 8, 4]], True),
     ],
 )
 def test_a_table_of_places_is_read(
