@@ -139,7 +139,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=44)
+RECONSTRUCT = Stage("reconstruct", revision=45)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -694,8 +694,6 @@ def clocks_of(
     """
     description, settings = flight.description, flight.settings
     prior_s, stated = load_clock_sigma(description, cameras)
-    if settings.method == "refined":  # it finds the clocks of which the manifest says that they are off
-        return None, np.where(stated, with_reference(description, cameras, prior_s), 0.0), None
     none, clocks, known = np.zeros(len(cameras)), None, np.zeros(len(cameras), dtype=np.bool_)
     exact = (prior_s == 0) & (settings.method == "auto")
     questioned_s = np.where(exact, QUESTIONED_SIGMA_S, prior_s)

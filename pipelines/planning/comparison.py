@@ -286,7 +286,7 @@ def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]
 def judge(
     measured: Mapping[str, MeasuredJoints], breaking: Collection[str], t_ns: Int64 | None = None
 ) -> dict[str, Any] | None:
-    """Find the arms that no other one beats; None if these are fewer than two, or measured nothing at all.
+    """Find the arms that no other one beats; None if there are fewer than two, or nothing was measured.
 
     Arms that are `breaking` limits are left out, unless all are. With `t_ns` [T] the errors are of films.
     """
@@ -305,7 +305,7 @@ def judge(
     beats = {pair for pair, signs in judged.items() if pair[0] in kept and max(signs) > 0 and min(signs) >= 0}
     unbeaten = [name for name in kept if not any(other == name for _, other in beats)]
     worse = [name for name in kept if any((one, name) in beats for one in unbeaten)]
-    if len(unbeaten) + len(worse) < len(kept[:2]):  # the others beat each other in a circle
+    if len(unbeaten) + len(worse) < min(len(kept), 2):  # the others beat each other in a circle
         unbeaten, worse = kept, []
     first, second = unbeaten[0], (unbeaten[1:] or worse or left_out)[0]
     disagreeing = next((pair for pair in permutations(unbeaten, 2) if judged[pair] == [1, -1]), None)

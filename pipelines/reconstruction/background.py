@@ -298,20 +298,9 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
 
     def refused(reason: str, reprojection_px: float = np.nan) -> Adjusted:
         stays = prior.covariance(len(position))
-        none = np.empty((len(position), 6, 0))
-        return Adjusted(
-            position,
-            rotation,
-            stays,
-            None,
-            none,
-            prior.constant[0],
-            np.zeros(3),
-            prior,
-            0,
-            reprojection_px,
-            reason,
-        )
+        modes, (shift_m, *_), turn = np.empty((len(position), 6, 0)), prior.constant, np.zeros(3)
+        px = reprojection_px
+        return Adjusted(position, rotation, stays, None, modes, shift_m, turn, prior, 0, px, reason)
 
     if not len(posed):
         return refused("none of its pictures has a pose")
@@ -631,14 +620,14 @@ class _Stretch:
             return self, None
         # A path that is free to bend may bend where the camera should turn: a stiff one turns first.
         stiff = _with_position_levels(prior, prior.white[0], _unknown(SHIFT_IN_WORLD, _UNKNOWN_RATE[0]))
-        begun, turn, found = self, self._searched(prior), None
+        begun, state, turn = self, self._zero(prior), self._searched(prior)
         for _ in range(_STIFF_STARTS):
             begun, zero = begun._turned(turn), self._zero(prior)
             found = begun._solve(zero, stiff, rounds=_FAR_ROUNDS, loss=_WIDE[0], settle=_SETTLE_ROUNDS)
             if found is None:
                 return self, None
-            turn = found[0].constant[3:6]
-        return begun, None if found is None else found[0]
+            state, turn = found[0], found[0].constant[3:6]
+        return begun, state
 
     def _zero(self, prior: PosePrior) -> _StretchState:
         constant = np.zeros(len(_sigma_of_constants(prior)))

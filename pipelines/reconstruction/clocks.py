@@ -83,7 +83,7 @@ class FoundClocks:
     """Clock offsets that the backgrounds or the keypoints determine."""
 
     offset_s: Float  # [C] to add to the pictures' times
-    sigma_s: Float  # [C] posterior standard deviation; the prior's where only the search found it, 0 if held
+    sigma_s: Float  # [C] posterior standard deviation; a fine step where only the search found it, 0 if held
     prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
     common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
     wrong: Mapping[str, str] = field(default_factory=dict)  # evidence against each stated clock that is moved
@@ -151,7 +151,7 @@ def searched_offsets_s(
     for camera in unknown.tolist():
         steps = int(SEARCH_REACH_SIGMAS * clock_sigma_s[camera] / SEARCH_STEP_S)
         if not steps:
-            shown[camera] = True  # elsewhere
+            shown[camera] = True  # the joint estimate finds less than one step
             continue
         shifts_s = SEARCH_STEP_S * np.arange(-steps, steps + 1)
         logarithms = np.array([logarithm(camera, each)[0] for each in shifts_s.tolist()])
@@ -161,8 +161,9 @@ def searched_offsets_s(
         count = _independent(logarithm(camera, best_s)[1])
         cost = 2 * count * logarithms + (shifts_s / clock_sigma_s[camera]) ** 2
         best_s = float(shifts_s[np.argmin(cost)])
-        # Of so many independent residuals, twice the logarithm of the rms varies by this.
-        shown[camera] = np.median(cost) - cost.min() > MIN_CONTRAST * np.sqrt(2 * count)
+        # Chance changes the cost of so many independent residuals by this.
+        usual = np.median(cost[np.isfinite(cost)])  # at other offsets the camera sees nothing
+        shown[camera] = usual - cost.min() > MIN_CONTRAST * np.sqrt(2 * count)
         if shown[camera] and best_s != 0:
             around_s = best_s + FINE_STEP_S * np.arange(-FINE_STEPS, FINE_STEPS + 1)
             found_s[camera] = min(around_s.tolist(), key=lambda each: logarithm(camera, each)[0])
@@ -173,7 +174,7 @@ def wrong_clocks(views_at: Callable[[float], Views], t_s: Float, questioned: Boo
     """Find clocks [C] s at whose stated times views disagree clearly more than at other times; 0 for others.
 
     One clock after the other is moved: that which lowers the disagreement most, so most must be right.
-    `views_at` is as for `initial_offsets_s`, `t_s` [T] the times, `questioned` [C] who may be wrong. Of two
+    `views_at` is as for `searched_offsets_s`, `t_s` [T] the times, `questioned` [C] who may be wrong. Of two
     that explain the same, the clock of `reference` is right.
     """
     steps = int(SEARCH_REACH_SIGMAS * QUESTIONED_SIGMA_S / SEARCH_STEP_S)

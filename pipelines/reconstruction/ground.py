@@ -237,11 +237,11 @@ def bind_positions(
             break
     if used.any():
         found = _of_pairs(matches, used)
-        turn = np.inf
+        turn_sigma = np.inf
         for _ in range(_LEVEL_ROUNDS):
             prior = _with_position_level(cameras, prior, solution)
-            turn = min(turn, _rotation_level(cameras, turn, solution))
-            solution, _ = _solve(found, _PriorEquations.of(prior).with_rotations(cameras, turn))
+            turn_sigma = min(turn_sigma, _rotation_level(cameras, turn_sigma, solution))
+            solution, _ = _solve(found, _PriorEquations.of(prior).with_rotations(cameras, turn_sigma))
     return _bound(cameras, pairs, counts, used, solution, _prior_sigma(cameras))
 
 
