@@ -188,13 +188,13 @@ def chained(
     links: dict[Edge, Link] = {}
     dropped: dict[str, int] = {}
     notes: list[str] = []
-    leads_ns = [np.median(rows.receive_ns - rows.header_ns) for rows in transforms.moving.values()]
-    lead_ns = int(np.median(leads_ns)) if leads_ns else 0
+    delays_ns = [np.median(rows.receive_ns - rows.header_ns) for rows in transforms.moving.values()]
+    delay_ns = int(np.median(delays_ns)) if delays_ns else 0
     for edge in route.edges:
         rows = every[edge]
         if is_static := edge not in transforms.moving or len(rows.header_ns) == 1:
             rows = _published_values(
-                [log[edge] for log in (transforms.static, transforms.moving) if edge in log], lead_ns
+                [log[edge] for log in (transforms.static, transforms.moving) if edge in log], delay_ns
             )
         poses = trajectory_of(rows, f"{source}: {_named(edge)}", stamps)
         links[edge] = Link(poses.t_ns, poses.position, poses.quaternion_xyzw, is_static)
@@ -220,18 +220,18 @@ def chained(
     return Gathered(trajectory, (parent, child), tuple(notes))
 
 
-def _published_values(logged: Sequence[LoggedRows], lead_ns: int) -> LoggedRows:
+def _published_values(logged: Sequence[LoggedRows], delay_ns: int) -> LoggedRows:
     """Join the rows of a static transform without repeats, by receipt, or by headers if these always rise.
 
-    A header from before the log began says nothing of a later publication: receipt less `lead_ns`, by which
+    A header from before the log began says nothing of a later publication: receipt less `delay_ns`, by which
     receipts are later than headers, counts.
     """
     receive_ns = np.concatenate([rows.receive_ns for rows in logged])
     order = np.argsort(receive_ns, kind="stable")
     receive_ns = receive_ns[order]
     header_ns = np.concatenate([rows.header_ns for rows in logged])[order]
-    is_old = (header_ns != 0) & (header_ns < receive_ns[0] - lead_ns)
-    header_ns = np.where(is_old, receive_ns - lead_ns, header_ns)
+    is_old = (header_ns != 0) & (header_ns < receive_ns[0] - delay_ns)
+    header_ns = np.where(is_old, receive_ns - delay_ns, header_ns)
     values = np.concatenate([rows.values for rows in logged])[order]
     kept = [0]
     for row in range(1, len(values)):

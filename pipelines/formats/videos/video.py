@@ -752,8 +752,8 @@ def _numbers_by_order(found: list[int], orders: dict[int, _Order]) -> Int64:
     # A decoder that misses a key frame mixes the pictures around it.
     numbers: Int64 = np.maximum.accumulate(np.sort(np.array(taken, np.int64)) - count) + count
     numbers -= numbers[0]
-    # More pictures lost than stored are rather damaged headers.
-    return numbers if numbers[-1] < 2 * len(orders) + _NEAR else by_packets
+    # Where a third of the pictures seems lost, headers are rather damaged.
+    return numbers if numbers[-1] < 1.5 * len(orders) else by_packets
 
 
 # --- decoding -----------------------------------------------------------------------------------------
