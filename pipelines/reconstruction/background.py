@@ -1045,7 +1045,7 @@ def refine_cameras(
             if aside is not None:
                 found, angle, _ = aside
                 warnings.append(
-                    f"{camera.name}: its pictures, which are believed, show that it looks"
+                    f"{camera.name}: corrected by its background, which shows that it looks"
                     f" {np.degrees(angle):.0f} deg beside its logged attitudes"
                 )
             refined.append(_with_poses(camera, t_ns, found))

@@ -98,7 +98,7 @@ class FoundClocks:
     def warnings(self) -> list[str]:
         """List clocks that pictures do not determine: nobody moved, or straight camera paths compensate."""
         return [
-            f"the videos do not determine the clock of {name}; it stays within what is stated of it"
+            f"the videos do not determine the clock of {name}: it is as uncertain as flight.yaml says"
             for name in self.undetermined
         ]
 

@@ -666,7 +666,7 @@ class _PriorEquations:
         return cls(np.diag(sigma**-2.0), np.zeros(len(sigma)))
 
     def with_rotations(self, cameras: Sequence[Camera], level: float) -> _PriorEquations:
-        """Narrow the constant rotations of logs, of which the backgrounds found a part, to a level (rad)."""
+        """Narrow the prior of the logs' constant rotations to a level (rad); backgrounds took off a part."""
         precision, pull = self.precision.copy(), self.pull.copy()
         for modes, mean in _rotated(cameras):
             more = max(level**-2.0 - modes.turn_sigma**-2.0, 0.0)

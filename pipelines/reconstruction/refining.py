@@ -225,8 +225,7 @@ def find_clocks(flight: RobustFlight, stated: Bool) -> FoundClocks:
     searched_s, shown = searched_offsets_s(views_at, flight.t_s[rows], unknown_s)
     searched_s = np.where(stated | (np.abs(searched_s) >= SEARCH_STEP_S), searched_s, 0.0)
     prior_s = np.where(shown & (stated | (searched_s != 0)), unknown_s, 0.0)
-    offset_s = searched_s
-    sigma_s = np.where(shown, np.minimum(FINE_STEP_S, prior_s), stated * unknown_s)
+    offset_s, sigma_s = searched_s, np.where(shown, np.minimum(FINE_STEP_S, prior_s), stated * unknown_s)
     if prior_s.any():
         limbs = replace(flight, clock_sigma_s=prior_s, only_limbs=True)
         refined, settled_s = _settle_clocks(limbs, searched_s)

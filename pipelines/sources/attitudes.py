@@ -190,7 +190,7 @@ def _unlike_log(name: str, laid: LaidMap, logged: Trajectory, note: Callable[[st
         note(
             f"{name}: in {len(unlike)} of {len(away_deg)} key pictures, {first_s:.0f} to {last_s:.0f} s after"
             f" the first, its log turns the camera otherwise than its pictures, by"
-            f" {float(np.median(away_deg[unlike])):.0f} deg: its pictures are believed"
+            f" {float(np.median(away_deg[unlike])):.0f} deg: its pictures are used"
         )
     return len(unlike)
 
