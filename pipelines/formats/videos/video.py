@@ -370,14 +370,7 @@ def _scan_of(path: Path, size: int, _changed_ns: int) -> _Scan:
             problem = f"is cut off before its first frame ends ({len(lost)} are lost)"
         raise damaged(path, problem)
     ticks = np.sort(np.array([pts for pts, _ in sure], dtype=np.int64))
-    furthest_s = max(abs(int(ticks[0])), abs(int(ticks[-1]))) * tick_s
-    if tick_s <= 0 or furthest_s > _LATEST_S:
-        raise damaged(path, f"stamps its frames up to {float(furthest_s):.3g} s")
-    shown_s = float((int(ticks[-1]) - int(ticks[0])) * tick_s)
-    # With ticks of a second the edit list, in ticks of its own, ends before most frames.
-    hidden = tick_s >= 1 and 2 * len(ticks) < listed
-    if hidden or shown_s < _SHORTEST_S * (len(ticks) - 1):
-        raise damaged(path, f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s")
+    _refuse_impossible(path, ticks, tick_s, listed)
     keys = np.array([pts for pts, key in sure if key], np.int64)
     given = _given(path, ticks, _key_frames(ticks, keys))
     if not given.any():
@@ -431,7 +424,21 @@ def _scan_in_order(path: Path, stored: int, tick_s: Fraction) -> _Scan:
     ticks = np.rint(np.interp(count, known, stamps[known]) + beyond * step).astype(np.int64)
     unseen = stored - len(shown) if codec != "mpeg4" else 0  # whose packets are no pictures
     dropped = {_NOT_GIVEN: unseen} if unseen > 0 else {}
-    return _Scan(np.maximum.accumulate(ticks - count) + count, tick_s, [], dropped, in_order=True)
+    ticks = np.maximum.accumulate(ticks - count) + count
+    _refuse_impossible(path, ticks, tick_s, len(ticks))
+    return _Scan(ticks, tick_s, [], dropped, in_order=True)
+
+
+def _refuse_impossible(path: Path, ticks: Int64, tick_s: Fraction, listed: int) -> None:
+    """Raise DataError for stamps that only damage explains."""
+    furthest_s = max(abs(int(ticks[0])), abs(int(ticks[-1]))) * tick_s
+    if tick_s <= 0 or furthest_s > _LATEST_S:
+        raise damaged(path, f"stamps its frames up to {float(furthest_s):.3g} s")
+    shown_s = float((int(ticks[-1]) - int(ticks[0])) * tick_s)
+    # With ticks of a second the edit list, in ticks of its own, ends before most frames.
+    hidden = tick_s >= 1 and 2 * len(ticks) < listed
+    if hidden or shown_s < _SHORTEST_S * (len(ticks) - 1):
+        raise damaged(path, f"shows {len(ticks)} of its {listed} frames within {shown_s:.3g} s")
 
 
 def _key_frames(ticks: Int64, keys: Int64) -> list[int]:
