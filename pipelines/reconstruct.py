@@ -10,6 +10,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -573,9 +574,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     warnings = [] if clocks is None else clocks.warnings()
     if flight.followed:
         errors = flight.errors(cameras)
-        cameras, background["background"], stayed = refine_cameras(
-            cameras, flight.followed, errors, between=flight.between
-        )
+        cameras, background["background"], stayed = _refined_by_backgrounds(flight, cameras, errors)
         cameras, moved = _brought_together(flight, cameras, errors)
         warnings += [*stayed, *moved]
         cameras = flight.waiting.put(cameras)
@@ -657,6 +656,24 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
             ),
         ],
     )
+
+
+def _refined_by_backgrounds(
+    flight: LoadedFlight, cameras: list[Camera], errors: Sequence[PoseErrors | None]
+) -> tuple[list[Camera], dict[str, Any], list[str]]:
+    """Refine cameras by their backgrounds; a large rotation is kept if more joints can be triangulated then.
+
+    Pictures of another flight or camera show a rotation, too.
+    """
+    refine = partial(refine_cameras, cameras, flight.followed, errors, between=flight.between)
+    refined = refine()
+    if len(cameras) == 1 or not any("aside_deg" in entry for entry in refined[1].values()):
+        return refined
+
+    def measured(found: tuple[list[Camera], dict[str, Any], list[str]]) -> int:
+        return int((_triangulated(flight, found[0]).result.status == STATUS.index("ok")).sum())
+
+    return max(refine(search=False), refined, key=measured)
 
 
 def _brought_together(

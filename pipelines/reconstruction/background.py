@@ -1028,8 +1028,12 @@ def refine_cameras(
     errors: Sequence[PoseErrors | None],
     *,
     between: Interpolation,
+    search: bool = True,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    """Refine cameras by the backgrounds `followed`: cameras, remaining errors, metrics and warnings."""
+    """Refine cameras by the backgrounds `followed`: cameras, remaining errors, metrics and warnings.
+
+    A background that would be refused is believed if a `search` finds that its camera looks beside the log.
+    """
     refined: list[Camera] = []
     entries: dict[str, Any] = {}
     warnings: list[str] = []
@@ -1041,7 +1045,7 @@ def refine_cameras(
         else:
             t_ns = camera.frame_t_ns[seen.rows]
             found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
-            aside = None if found.refused is None else _found_aside(camera, seen, between)
+            aside = _found_aside(camera, seen, between) if search and found.refused is not None else None
             if aside is not None:
                 found, angle, _ = aside
                 warnings.append(
@@ -1062,7 +1066,7 @@ def refine_cameras(
                     "log": float(np.degrees(prior.level[1])),
                     "background": float(np.degrees(np.sqrt(np.median(turn)))) if used else None,
                 },
-            }
+            } | ({} if aside is None else {"aside_deg": float(np.degrees(aside[1]))})
             if found.frozen:
                 warnings.append(
                     f"{camera.name}: its logged position never changes, but its pictures do not show a camera"
