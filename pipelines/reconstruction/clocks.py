@@ -131,8 +131,8 @@ def searched_offsets_s(
 
     `views_at` returns the views with all unknown clocks moved forward by seconds, the same number of
     joint-frames at each of the times `t_s` [T]; `clock_sigma_s` [C] is 0 for a known clock. Where nobody
-    moves, views agree equally well at all offsets but for chance; such clocks stay. So do all if none is
-    known.
+    moves, views agree equally well at all offsets but for chance; such clocks stay. So do clocks whose best
+    offset leaves less than half of the stated times, and all if none is known.
     """
     found_s, shown = np.zeros(len(clock_sigma_s)), np.zeros(len(clock_sigma_s), dtype=np.bool_)
     unknown = np.flatnonzero(clock_sigma_s > 0)
@@ -163,7 +163,9 @@ def searched_offsets_s(
         best_s = float(shifts_s[np.argmin(cost)])
         # Chance changes the cost of so many independent residuals by this.
         usual = np.median(cost[np.isfinite(cost)])  # at other offsets the camera sees nothing
-        shown[camera] = usual - cost.min() > MIN_CONTRAST * np.sqrt(2 * count)
+        clear = usual - cost.min() > MIN_CONTRAST * np.sqrt(2 * count)
+        times, stated = (len(logarithm(camera, each)[1]) for each in (best_s, 0.0))
+        shown[camera] = clear and times >= LEAST_SHARE_OF_TIMES * stated
         if shown[camera] and best_s != 0:
             around_s = best_s + FINE_STEP_S * np.arange(-FINE_STEPS, FINE_STEPS + 1)
             found_s[camera] = min(around_s.tolist(), key=lambda each: logarithm(camera, each)[0])
