@@ -29,7 +29,7 @@ def init_command(paths: tuple[Path, ...], output: Path | None, overwrite: bool, 
     PATHS are files and folders; folders are searched. Names (drone1.mp4, drone1_poses.tum, /drone1/odometry,
     a camera of a calibration) and times decide what belongs to which camera. What no file states, such as a
     frame rate, a clock or a mount, is assumed and marked with `assumed: true`, or named as missing. Read the
-    manifest before you ingest it. Without any camera, the exit status is 1.
+    manifest before you ingest it. Without pictures or keypoints of any camera, the exit status is 1.
     """
     from pipelines.draft import draft
     from pipelines.ingest import OF_ONE_CAMERA
@@ -57,10 +57,12 @@ def init_command(paths: tuple[Path, ...], output: Path | None, overwrite: bool, 
             say(OF_ONE_CAMERA, err=True)
         say(f"cameras: {', '.join(result.cameras) or 'none'}")
         say(f"written: {_from_here(result.path)}")
-        if result.cameras:
+        if result.filmed:
             first = "write what is missing, then " if result.missing else ""
             say_next(f"{first}mocap check {{}}", _from_here(result.path), shown.quiet)
-    if not result.cameras:
+        else:
+            say_next("add films or keypoints, then mocap init {}", paths[0], shown.quiet)
+    if not result.filmed:
         raise SystemExit(1)
 
 

@@ -10,7 +10,7 @@ import click
 
 from mocap_cli.options import Shown, any_path, any_place, force_option, output_options, overwrite_option
 from mocap_cli.several import end, expanded, tell
-from mocap_cli.terminal import print_json, say, say_next, say_warnings, watching
+from mocap_cli.terminal import after_page, print_json, say, say_next, say_warnings, watching
 from pipelines.session.errors import MocapError
 
 if TYPE_CHECKING:
@@ -110,5 +110,5 @@ def report_command(
     for result in [*results, *(one for one in (compared, drawn) if one is not None)]:
         say(f"{'unchanged' if result.skipped else 'written'}: {result.place}")
     if len(ones) == 1:
-        say_next("mocap export {} --to trc,angles", ones[0], shown.quiet)
+        say_next(after_page(ones[0]), ones[0], shown.quiet)
     end(failed, ones)

@@ -146,6 +146,18 @@ def say_next(command: str, place: Path | str, quiet: bool) -> None:
         held.setdefault(command, []).append(shlex.quote(str(place)))
 
 
+def after_page(session: Path) -> str:
+    """Return the command that follows when one has looked at a session, as its page says."""
+    from pipelines.session.storage import read_json
+
+    metrics = session / "reconstruct" / "metrics.json"
+    if not metrics.is_file():
+        return "mocap reconstruct {}"
+    verdict = read_json(metrics).get("verdict") or {}
+    follows = str(verdict.get("next", ""))
+    return follows if follows.startswith("mocap check") else "mocap export {} --to trc,angles"
+
+
 _HELD = "mocap.next"
 
 

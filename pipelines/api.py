@@ -16,6 +16,7 @@ from pipelines.check import check
 from pipelines.draft import draft
 from pipelines.export import export
 from pipelines.ingest import ingest
+from pipelines.planning.config import PlannerConfig
 from pipelines.planning.scene import ReplanSettings
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.replan import replan as replan_compare
@@ -29,6 +30,7 @@ from pipelines.simulate import simulate
 
 __all__ = [
     "DataError",
+    "PlannerConfig",
     "ReconstructSettings",
     "ReplanSettings",
     "angles",

@@ -141,6 +141,7 @@ class Drafted:
     path: Path
     text: str
     cameras: list[str]
+    filmed: bool  # one of them has pictures or keypoints
     missing: list[str]  # the flight cannot be ingested without it
     assumed: list[str]  # the flight can be ingested, but results depend on it
     left_out: dict[Path, str]  # paths that were not used, with the reason
@@ -198,6 +199,7 @@ def draft(
         path=target,
         text=text,
         cameras=[camera.name for camera in flight.cameras],
+        filmed=any(each for camera in flight.cameras for each in camera.pictures.values()),
         missing=manifest.missing or ([problem] if problem else []),
         assumed=manifest.assumed,
         left_out=search.left_out,

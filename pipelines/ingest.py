@@ -122,8 +122,9 @@ def ingest(
 
     Frames have no pose between two further apart than `max_pose_gap_s`, or further than `max_extrapolation_s`
     before or after all. `strict` refuses a flight of which anything could not be used, or that is doubted;
-    `overwrite` writes also to a target that holds something else. DataError: something cannot be used, or was
-    changed while it was read; the session stays as it was. BusyError: another process writes the session.
+    `overwrite` writes also to a target that holds something else; `force` reads all anew. DataError:
+    something cannot be used, or was changed while it was read; the session stays as it was. BusyError:
+    another process writes the session.
     """
     progress = progress or Silent()
     flight = read_flight(flight_path)

@@ -92,7 +92,8 @@ def report(
 ) -> Reported:
     """Write report/index.html of a session, or its page at `output`, if anything changed (or by `force`).
 
-    `studies` are folders of `mocap study` that the page shows as well; `overwrite` replaces a file at
+    `studies` are folders of `mocap study` that the page shows as well, `video` how much film it holds (none,
+    small or full); `force` writes it anew though nothing changed; `overwrite` replaces a file at
     `output` that is no page of mocap. DataError: not a session, or damaged; a table of it, or pictures, were
     changed; a folder that holds no study; the page cannot be written. BusyError: another process writes the
     session.

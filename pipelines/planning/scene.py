@@ -457,13 +457,17 @@ NOISE_LOOKS = 200
 
 @dataclass(frozen=True)
 class ReplanSettings:
-    """Settings that determine a comparison, in addition to the session; None takes the session's value."""
+    """Settings that determine a comparison, in addition to the session; None takes the session's value.
 
-    arms: tuple[str, ...] | None = (
-        None  # adaptive and fixed, flown if cameras moved, planned if commands are logged
-    )
-    drones: int | None = None  # the number of cameras, 2 to 20
-    yaw_deg: float | None = None  # of the first camera at the start, from east
+    `arms` are names (by default adaptive and fixed, joint or group, flown if cameras moved, planned if
+    commands are logged), `drones` 2 to 20, `yaw_deg` the direction of the first camera at the start, from
+    east. `trials` are draws of all errors with this `seed`; `pose_noise` is text as of `--pose-noise`, and
+    `planner` has the settings of docs/planner.md.
+    """
+
+    arms: tuple[str, ...] | None = None
+    drones: int | None = None
+    yaw_deg: float | None = None
     trials: int = 100
     seed: int = 0
     pose_noise: str | None = None
