@@ -79,7 +79,7 @@ SPECIAL: dict[str, tuple[str, Any]] = {
         lambda xy, *_: (np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2])), {}),
     ),
 }
-"""What `auto` can leave out, and what does that: a name in pipelines, and its other value."""
+"""Special cases of `auto`: the name in pipelines that is replaced, and the value without the case."""
 ALWAYS = ("auto", "robust")
 """Methods that are measured on all draws; the first finds the clocks, and its time is taken."""
 GIVEN: tuple[Given, ...] = ("model", "nothing")

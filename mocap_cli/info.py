@@ -8,7 +8,7 @@ import click
 
 from mocap_cli.options import json_option
 from mocap_cli.several import each
-from mocap_cli.terminal import after_page, one_line, say, say_next
+from mocap_cli.terminal import one_line, say, say_next
 
 # Longer lists are cut, so that each stays on a line or two.
 _MAX_LISTED = 12
@@ -46,8 +46,8 @@ def info_command(path: Path, as_json: bool) -> dict[str, Any] | None:
         _print_facts(reading.facts, indent=2)
     if readings:
         follows = _NEXT.get(readings[-1].title, "mocap init {}")
-        if readings[-1].title == "session" and after_page(path).startswith("mocap reconstruct"):
-            follows = after_page(path)
+        if readings[-1].title == "session" and not (path / "reconstruct" / "stage.json").is_file():
+            follows = "mocap reconstruct {}"
         say_next(follows, path, quiet=False)
     return None
 

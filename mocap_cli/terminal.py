@@ -153,8 +153,8 @@ def after_page(session: Path) -> str:
     metrics = session / "reconstruct" / "metrics.json"
     if not metrics.is_file():
         return "mocap reconstruct {}"
-    verdict = read_json(metrics).get("verdict") or {}
-    follows = str(verdict.get("next", ""))
+    verdict = read_json(metrics).get("verdict")
+    follows = str(verdict.get("next", "")) if isinstance(verdict, dict) else ""
     return follows if follows.startswith("mocap check") else "mocap export {} --to trc,angles"
 
 
