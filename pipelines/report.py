@@ -67,7 +67,7 @@ from pipelines.session.tables import (
 from pipelines.session.urls import is_there
 from pipelines.sources.pictures import CameraPictures, open_pictures, refuse_changed_pictures
 
-REPORT = Stage("report", revision=24)
+REPORT = Stage("report", revision=25)
 # Figures of another revision are drawn again.
 _FIGURES_REVISION = 8
 

@@ -176,7 +176,7 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
             }
             for names in alike
         ],
-        "verdict": ". ".join([*broken, verdict(best, list(arms))]),
+        "verdict": "; ".join([*broken, verdict(best, list(arms))]),
         "notes": list(scene.notes),
         "warnings": [*broken, *_unequal(arms), *scene.warnings, *_warnings(scene, results)],
     }

@@ -526,9 +526,9 @@ def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
 
 
 def _short(reason: str) -> str:
-    """Cut a reason between two words for the first screen."""
+    """Cut a reason for the first screen: behind a clause, else between two words."""
     kept = reason[:MOST_REASON_CHARACTERS]
-    return reason if kept == reason else f"{kept.rpartition(' ')[0]} …"
+    return reason if kept == reason else f"{kept.rpartition('; ')[0] or kept.rpartition(' ')[0]} …"
 
 
 def _reason_for_no_result(summary: Summary) -> str:
