@@ -120,6 +120,10 @@ class Trial:
         """Return the name of one camera, or `every camera`."""
         return self.names[group[0]] if len(group) == 1 < len(self.names) else "every camera"
 
+    def those(self, group: Sequence[int]) -> str:
+        """Return the name of one camera, or `all cameras`."""
+        return "all cameras" if len(group) == len(self.names) else self.names[group[0]]
+
     def groups(self, members: Sequence[int]) -> Iterator[tuple[list[int], float]]:
         """Take all cameras together, then each, which is dearer."""
         if len(members) > 1:
@@ -159,22 +163,26 @@ def turn_about(axis: str, degrees: float) -> Float:
 def rates(trial: Trial) -> Iterator[Alternative]:
     """Try other frame rates of all cameras and of each."""
     for group, price in trial.groups(trial.every):
-        whose = "all cameras" if len(group) == len(trial.names) else trial.names[group[0]]
         stated_hz = remedies.rate_hz(trial.cameras[group[0]])
-        usual = _is_usual(stated_hz)
         others = (hz for hz in _USUAL_RATES_HZ if abs(stated_hz / hz - 1) > _SAME_RATE)
-        for factor in (stated_hz / hz for hz in others) if usual else RATES:
+        for factor in (stated_hz / hz for hz in others) if _is_usual(stated_hz) else RATES:
             unfilmed = [_unfilmed(trial.cameras[k], factor) - _unfilmed(trial.cameras[k]) for k in group]
-            dearer = _PRICE_OF_UNFILMED * float(np.mean(unfilmed))
-            yield Alternative(
-                "frame_rate",
-                trial.named(group),
-                f"the frame rate of {whose} is {remedies.times_faster(factor)}",
-                remedies.frame_rate(trial.cameras, group, factor),
-                price + max(0.0, dearer) + _PRICE_OF_UNUSUAL_RATE * (not _is_usual(stated_hz / factor)),
-                trial.with_times(group, slower=factor),
-                alike=len(group) == len(trial.names),
-            )
+            dearer = max(0.0, _PRICE_OF_UNFILMED * float(np.mean(unfilmed)))
+            dearer += _PRICE_OF_UNUSUAL_RATE * (not _is_usual(stated_hz / factor))
+            yield rate(trial, group, factor, price + dearer)
+
+
+def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> Alternative:
+    """Change the frame rate of one camera, or of all."""
+    return Alternative(
+        "frame_rate",
+        trial.named(group),
+        f"the frame rate of {trial.those(group)} is {remedies.times_faster(factor)}",
+        remedies.frame_rate(trial.cameras, group, factor),
+        price,
+        trial.with_times(group, slower=factor),
+        alike=len(group) == len(trial.names),
+    )
 
 
 def _is_usual(rate_hz: float) -> bool:
@@ -190,16 +198,14 @@ def _unfilmed(camera: Filmed, slower: float = 1.0) -> float:
 
 def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
     """Move the clock of one camera, or of all."""
-    alike = len(group) == len(trial.names)
-    whose = "all cameras" if alike else trial.names[group[0]]
     return Alternative(
         "clock",
         trial.named(group),
-        f"the pictures of {whose} were taken {remedies.earlier_or_later(late_s)}",
+        f"the pictures of {trial.those(group)} were taken {remedies.earlier_or_later(late_s)}",
         remedies.clock(trial.cameras, group, late_s),
         1.0 + abs(late_s) / 2,
         trial.with_times(group, late_s),
-        alike=alike,
+        alike=len(group) == len(trial.names),
     )
 
 

@@ -37,10 +37,8 @@ from pipelines.reconstruction.doubts.scene import (
     stature_m,
 )
 from pipelines.reconstruction.doubts.score import (
-    Base,
     Fit,
     Score,
-    base_of,
     fit,
     picture_variance,
     residuals_px,
@@ -246,14 +244,14 @@ def diagnose(
     if flight is None or len(flight.cameras) < 2:
         return []
     trial = Trial(flight, scene_of(flight))
-    base, found = base_of(flight, trial.described)
+    found = score(flight, trial.described)
     # A turned world leaves rays and bodies as they are; rolled cameras mirror the body.
     mirrored = any(found.odd[name].sigmas >= STRANGE for name in ("face", "bend") if name in found.odd)
     fits = found.misfit < MISSED and found.scatter < _MEETING and not mirrored
-    objective = Objective(trial, base)
+    objective = Objective(trial, found)
     tried: list[Tried | None] = [*_of_logs(objective), *_of_turns(objective, late)]
     strange = _is_strange(found)
-    odd = strange or base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
+    odd = strange or found.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
     if odd:
         tried += map(objective.scored, alternatives.discrete(trial))
         tried += map(objective.with_numbers, alternatives.numbers_of_all(trial))
@@ -284,7 +282,7 @@ def diagnose(
         _doubt(trial, each, found, [cause.alternative.code for cause in causes if cause.score])
         for each in causes
     ]
-    if doubts or strange or base.total >= DOUBTFUL or gained >= _WITHOUT_CAUSE:
+    if doubts or strange or found.total >= DOUBTFUL or gained >= _WITHOUT_CAUSE:
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
         named |= {"clock"} if "frame_rate" in named else set()
@@ -355,7 +353,7 @@ class Objective:
     (the likelihood of Student's t).
     """
 
-    def __init__(self, trial: Trial, base: Base) -> None:
+    def __init__(self, trial: Trial, base: Score) -> None:
         self.trial, self.base, self.best_total = trial, base, base.total
         self._pictures = np.isfinite(trial.described.rays[..., 0]).any(axis=-1).sum(axis=1)  # [C]
         self.described = self._fit(trial.described)
@@ -623,18 +621,14 @@ def _of_turns(objective: Objective, tried: Sequence[Lateness]) -> list[Tried]:
     late = max(tried, key=gain)
     if late.gain < LEAST_GAIN or (late.slower == 1 and not is_sure_clock(late)):
         return []
-    names, cameras = trial.names, trial.cameras
-    whose = "all cameras" if len(late.cameras) == len(names) else names[late.cameras[0]]
-    by = "as the turning of their backgrounds shows"
-    evidence = {"turning_gain": round(late.gain, 1)}
+    group, evidence = list(late.cameras), {"turning_gain": round(late.gain, 1)}
     if late.slower != 1:
-        code, remedy = "frame_rate", remedies.frame_rate(cameras, late.cameras, late.slower)
-        what = f"the frame rate of {whose} is {remedies.times_faster(late.slower)}, {by}"
+        seen = alternatives.rate(trial, group, late.slower)
     else:
-        code, remedy = "clock", remedies.clock(cameras, late.cameras, late.late_s)
-        what = f"the pictures of {whose} were taken {remedies.earlier_or_later(late.late_s)}, {by}"
+        seen = alternatives.clock(trial, group, late.late_s)
         evidence["clock_sigma_s"] = round(late.sigma_s, 3)
-    return [Tried(Alternative(code, trial.named(late.cameras), what, remedy, 0.0, evidence=evidence))]
+    what = f"{seen.what}, as the turning of their backgrounds shows"
+    return [Tried(replace(seen, what=what, scene=None, evidence=evidence))]
 
 
 def _is_explained(causes: Sequence[Tried]) -> bool:

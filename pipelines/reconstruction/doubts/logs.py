@@ -5,7 +5,8 @@ from itertools import combinations
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.poses import interpolate_poses
 from pipelines.session.description import CameraEntry, Doubt
 from pipelines.session.records import Trajectory
 
@@ -141,9 +142,11 @@ def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt |
     start, end = max(one.t_ns[0], other.t_ns[0]), min(one.t_ns[-1], other.t_ns[-1])
     if start >= end:
         return None
-    t_ns = np.linspace(start, end, _MOMENTS)
-    apart_m = float(np.median(np.linalg.norm(_place(one, t_ns) - _place(other, t_ns), axis=1)))
-    turned_deg = float(np.median(_turned_deg(one, other, t_ns)))
+    t_ns = np.linspace(start, end, _MOMENTS).astype(np.int64)
+    places, turns = zip(*(_poses_at(track, t_ns) for track in (one, other)), strict=True)
+    apart_m = float(np.median(np.linalg.norm(places[0] - places[1], axis=1)))
+    cosine = np.clip(np.abs((turns[0] * turns[1]).sum(axis=1)), 0, 1)
+    turned_deg = float(np.median(np.degrees(2 * np.arccos(cosine))))
     starts_apart_m = float(np.linalg.norm(one.position[0] - other.position[0]))
     first, second = pair
     poses = [entry.poses for entry, _ in pair.values()]
@@ -167,21 +170,11 @@ def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt |
     return None
 
 
-def _place(track: Trajectory, t_ns: Float) -> Float:
-    since = (track.t_ns - track.t_ns[0]).astype(np.float64)
-    at = t_ns - track.t_ns[0]
-    return np.stack([np.interp(at, since, track.position[:, axis]) for axis in range(3)], axis=1)
-
-
-def _turned_deg(one: Trajectory, other: Trajectory, t_ns: Float) -> Float:
-    """Return the angles [N] between two attitudes, each the next that was logged."""
-    nearest = [
-        track.quaternion_xyzw[np.minimum(np.searchsorted(track.t_ns, t_ns), len(track.t_ns) - 1)]
-        for track in (one, other)
-    ]
-    cosine = np.abs((nearest[0] * nearest[1]).sum(axis=1))
-    angle: Float = np.degrees(2 * np.arccos(np.clip(cosine, 0, 1)))
-    return angle
+def _poses_at(track: Trajectory, t_ns: Int64) -> tuple[Float, Float]:
+    """Interpolate positions [N, 3] and rotations [N, 4], also across gaps of the log."""
+    gap_ns = int(track.t_ns[-1] - track.t_ns[0]) + 1
+    poses = (track.t_ns, track.position, track.quaternion_xyzw, t_ns)
+    return interpolate_poses(*poses, max_gap_ns=gap_ns, max_extrapolation_ns=0)
 
 
 def _topic(pair: Mapping[str, CameraEntry]) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
+from pipelines.geometry.poses import interpolate_points
 from pipelines.reconstruction.observations import UNSTATED, Camera, Filmed, PoseSigma
 from pipelines.session.camera_poses import stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
@@ -274,7 +275,9 @@ def scene_of(
         since = first + (since - first) * factor + late * 1e9
         unposed.append(_outside(since + flight.t_ns[0], camera, flight.between))
         stated_ns[index] = first + (moments - late * 1e9 - first) / factor
-        at = _interpolated(since, seen, moments)
+        longest_ns = max(_LONGEST_GAP_NS, 1.5 * float(np.median(np.diff(since)))) if len(since) > 1 else 0
+        since_ns, at_ns = np.rint(since).astype(np.int64), flight.t_ns - flight.t_ns[0]
+        at = interpolate_points(since_ns, seen, at_ns, max_gap_ns=int(longest_ns))
         rays[index] = undistort(at, camera.intrinsics)
         row = at[..., 1]
         person_px.append(median(np.fmax.reduce(row, axis=1) - np.fmin.reduce(row, axis=1)))
@@ -301,21 +304,6 @@ def _outside(t_ns: Float, camera: Filmed, between: Interpolation) -> float:
 def _poses(flight: Sampled) -> tuple[Float, Float]:
     posed = [camera.camera.poses_at(flight.t_ns, flight.between) for camera in flight.cameras]
     return np.array([position for position, _ in posed]), np.array([rotation for _, rotation in posed])
-
-
-def _interpolated(since: Float, values: Float, at: Float) -> Float:
-    """Interpolate values [F, J, 2] at times [T] (both ns); NaN across gaps and outside."""
-    if len(since) < 2:
-        return np.full((len(at), *values.shape[1:]), np.nan)
-    steps = np.diff(since)
-    longest = max(_LONGEST_GAP_NS, 1.5 * float(np.median(steps)))
-    before = np.clip(np.searchsorted(since, at, side="right") - 1, 0, len(since) - 2)
-    fraction = (at - since[before]) / steps[before]
-    within = (fraction >= 0) & (fraction <= 1) & (steps[before] <= longest)
-    weight = fraction[:, None, None]
-    between: Float = values[before] * (1 - weight) + values[before + 1] * weight
-    between[~within] = np.nan
-    return between
 
 
 def median(values: Float) -> float:

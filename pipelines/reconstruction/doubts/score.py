@@ -16,8 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64, known_median
-from pipelines.geometry.compilation import cached, helper
+from pipelines.geometry.arrays import Bool, Float, Index, Int64, known_median
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.reconstruction.doubts.scene import (
     FEW,
@@ -57,6 +56,8 @@ _HUBER = 1.5
 _USUAL_M = 10.0
 # With fewer rays nothing can be fitted.
 _FEWEST_RAYS = 60
+# A vector times this has the products of the three axes with it as columns, one row after the other.
+_CROSS = np.array([np.cross(np.eye(3), axis).T.ravel() for axis in np.eye(3)])
 
 Make = Callable[[Float], SceneOfMoments]
 """A scene from the numbers [n] of an alternative."""
@@ -90,71 +91,32 @@ def solve(scene: SceneOfMoments) -> SolvedJoints:
     """Triangulate by least squares of distances to rays, weighted by what keypoints and poses err by."""
     direction = _directions(scene)
     seen: Bool = np.isfinite(direction[..., 0] + scene.position.sum(axis=-1)[..., None])
-    direction, centre = np.where(seen[..., None], direction, 0.0), np.nan_to_num(scene.position)
+    direction = np.where(seen[..., None], direction, 0.0)
+    ray = np.ascontiguousarray(np.moveaxis(direction, -1, 0))
+    centre = np.moveaxis(np.nan_to_num(scene.position), -1, 0)[..., None]
+    off = centre - ray * (ray * centre).sum(axis=0)  # of each line from the origin
     angle2 = pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2
-    views = seen.sum(axis=0)
-    joints, chi2, depth = _meet(direction, centre, seen, angle2, scene.sigma[:, 0] ** 2)
-    joints[views < 2] = np.nan
+    joints, chi2, depth = off[:, 0], off[0, 0], np.full(seen.shape, _FIRST_M)
+    for _ in range(2):
+        far2 = np.clip(np.abs(depth), _NEAREST_M, _FARTHEST_RAY_M) ** 2
+        weight = seen / (far2 * angle2[:, None, None] + scene.sigma[:, 0, None, None] ** 2)
+        matrix = -((weight * ray)[:, None] * ray).sum(axis=2)
+        matrix[range(3), range(3)] += weight.sum(axis=0) * (1 + _FIRM) + 1e-30
+        joints = (_inverse(matrix) * (weight * off).sum(axis=1)).sum(axis=1)
+        toward = joints[:, None] - centre
+        depth = (toward * ray).sum(axis=0)
+        chi2 = (weight * ((toward - depth * ray) ** 2).sum(axis=0)).sum(axis=0)
+    depth, views = np.where(seen, depth, 0.0), seen.sum(axis=0)
+    joints = np.where(views < 2, np.nan, joints).transpose(1, 2, 0)
     in_front: Bool = np.asarray(((depth > 0) | ~seen).all(axis=0))
     return SolvedJoints(joints, chi2, views, in_front, direction, seen, depth)
 
 
-@helper
-def _inverse(m: Float, inverse: Float) -> None:
-    """Invert a symmetric matrix [3, 3] in place of another."""
-    inverse[0, 0], inverse[1, 1] = m[1, 1] * m[2, 2] - m[1, 2] ** 2, m[0, 0] * m[2, 2] - m[0, 2] ** 2
-    inverse[0, 1] = inverse[1, 0] = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
-    inverse[0, 2] = inverse[2, 0] = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
-    inverse[1, 2] = inverse[2, 1] = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]
-    inverse[2, 2] = m[0, 0] * m[1, 1] - m[0, 1] ** 2
-    inverse /= m[0, 0] * inverse[0, 0] + m[0, 1] * inverse[0, 1] + m[0, 2] * inverse[0, 2]
-
-
-@cached
-def _meet(
-    direction: Float, centre: Float, seen: Bool, angle2: Float, place2: Float
-) -> tuple[Float, Float, Float]:
-    """Return the joints [T, J, 3] nearest to rays, their chi^2 [T, J] and depths [C, T, J]; 0 if unseen."""
-    cameras, times, names = seen.shape
-    joints, chi2, depth = np.zeros((times, names, 3)), np.zeros((times, names)), np.zeros(seen.shape)
-    matrix, inverse, right, weights = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(cameras)
-    for t in range(times):
-        for j in range(names):
-            for second in range(2):
-                matrix[:], right[:], chi2[t, j] = 0.0, 0.0, 0.0
-                for c in range(cameras):
-                    if not seen[c, t, j]:
-                        continue
-                    away = min(max(abs(depth[c, t, j]), _NEAREST_M), _FARTHEST_RAY_M) if second else _FIRST_M
-                    weights[c] = 1 / (away**2 * angle2[c] + place2[c])
-                    along = 0.0
-                    for i in range(3):
-                        along += direction[c, t, j, i] * centre[c, t, i]
-                    for i in range(3):
-                        ray = weights[c] * direction[c, t, j, i]
-                        right[i] += weights[c] * centre[c, t, i] - ray * along
-                        matrix[i, i] += weights[c] * (1 + _FIRM) + 1e-30
-                        for k in range(3):
-                            matrix[i, k] -= ray * direction[c, t, j, k]
-                if matrix[0, 0] == 0.0:
-                    continue
-                _inverse(matrix, inverse)
-                for i in range(3):
-                    joints[t, j, i] = (
-                        inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
-                    )
-                for c in range(cameras):
-                    if not seen[c, t, j]:
-                        continue
-                    along, apart2 = 0.0, 0.0
-                    for i in range(3):
-                        along += (joints[t, j, i] - centre[c, t, i]) * direction[c, t, j, i]
-                    for i in range(3):
-                        apart = joints[t, j, i] - centre[c, t, i] - along * direction[c, t, j, i]
-                        apart2 += apart * apart
-                    depth[c, t, j] = along
-                    chi2[t, j] += weights[c] * apart2
-    return joints, chi2, depth
+def _inverse(matrix: Float) -> Float:
+    """Invert symmetric matrices [3, 3, ...] by their cofactors."""
+    one, other = [1, 2, 0], [2, 0, 1]
+    cofactors = matrix[one][:, one] * matrix[other][:, other] - matrix[one][:, other] * matrix[other][:, one]
+    return np.asarray(cofactors / (matrix[0] * cofactors[0]).sum(axis=0))
 
 
 @dataclass(frozen=True)
@@ -214,93 +176,42 @@ def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Fl
     return (toward - along[..., None] * direction) / far[..., None], far
 
 
-@helper
-def _missed(joint: Float, place: Float, ray: Float, axis: int) -> float:
-    """Return by how much a ray misses a joint along an axis, over its depth."""
-    along = 0.0
-    for i in range(3):
-        along += (joint[i] - place[i]) * ray[i]
-    missed: float = (joint[axis] - place[axis] - along * ray[axis]) / max(abs(along), _NEAR_M)
-    return missed
+def _by_errors(joints: Float, position: Float, direction: Float, missed: Float) -> Float:
+    """Return the derivatives [C, T, J, 3, 6] of the misses by each camera's shift and turn."""
+    toward = joints - position[:, :, None]
+    along = (toward * direction).sum(axis=-1)
+    far = np.maximum(np.abs(along), _NEAR_M)[..., None, None]
+    leaning = direction + missed * np.where(np.abs(along) > _NEAR_M, np.sign(along), 0.0)[..., None]
+    shifted = leaning[..., None] * direction[..., None, :] - np.eye(3)
+    turned = along[..., None, None] * (direction @ _CROSS).reshape(*direction.shape, 3)
+    turned += leaning[..., None] * np.cross(direction, toward)[..., None, :]
+    return np.concatenate([shifted / far, -turned / far], axis=-1)
 
 
-@cached
-def _linear(
-    joints: Float,
-    place: Float,
-    ray: Float,
-    probed_place: Float,
-    probed_ray: Float,
-    root: Float,
-    placed: Float,
-    pull: Float,
-) -> tuple[Float, Float, Float]:
-    """Linearise the misses of rays from places [C, T, 3] to joints [T, J, 3], and solve for the joints.
+def _normal_equations(rows: Float, placed: Float, pull: Float) -> tuple[Float, Float]:
+    """Make the equations of constant errors and numbers, with the joints eliminated.
 
-    Probed places [n, C, T, 3] and rays [n, C, T, J, 3] have one number each changed by a step; `root` [C, T,
-    J] are roots of weights; `placed` [T, J] are weights of known places, `pull` [T, J, 3] towards them.
-    Return weighted derivatives [C, 3 T J, 6 + n + 1] by each camera's shift and turn, by the numbers, and the
-    misses; those by the joints times these [3 T J, 6 C + n + 1]; and this with the joints solved.
+    Args:
+        rows: [C, T, J, 3, 6 + n + 1] weighted derivatives of the misses by each camera's shift and turn, by
+            the n numbers, and the misses.
+        placed: [T, J] weights of known places.
+        pull: [T, J, 3] towards these.
+
+    Return normal matrix and right side [6 C + n, 6 C + n + 1], and by how much each unknown moves the joints
+    [T, J, 3, 6 C + n].
     """
-    cameras, times, names = root.shape
-    numbers = len(probed_ray)
-    width = 6 * cameras + numbers + 1
-    rows = np.zeros((cameras, 3 * times * names, 7 + numbers))
-    both = np.zeros((3 * times * names, width))
-    solution = np.zeros((3 * times * names, width))
-    matrix, inverse, by_joint = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    for t in range(times):
-        for j in range(names):
-            first = 3 * (t * names + j)
-            matrix[:] = 0.0
-            for i in range(3):
-                matrix[i, i] = placed[t, j] + _FIRM
-                both[first + i, width - 1] = -pull[t, j, i]
-            for c in range(cameras):
-                if root[c, t, j] == 0.0:
-                    continue
-                d, weight = ray[c, t, j], root[c, t, j]
-                along = 0.0
-                for i in range(3):
-                    along += (joints[t, j, i] - place[c, t, i]) * d[i]
-                far = max(abs(along), _NEAR_M)
-                farther = np.sign(along) if abs(along) > _NEAR_M else 0.0
-                for i in range(3):
-                    row = rows[c, first + i]
-                    missed = _missed(joints[t, j], place[c, t], d, i)
-                    for k in range(3):
-                        by_joint[i, k] = weight * ((i == k) - d[i] * d[k] - missed * farther * d[k]) / far
-                        row[k] = -by_joint[i, k]
-                        # The ray turns about axis k, by the product of that with the ray.
-                        one, other = (k + 1) % 3, (k + 2) % 3
-                        turn = 0.0
-                        if i == one:
-                            turn = -d[other]
-                        elif i == other:
-                            turn = d[one]
-                        nearer = (joints[t, j, other] - place[c, t, other]) * d[one]
-                        nearer -= (joints[t, j, one] - place[c, t, one]) * d[other]
-                        row[3 + k] = -weight * (along * turn + nearer * (d[i] + missed * farther)) / far
-                    for k in range(numbers):
-                        moved = _missed(joints[t, j], probed_place[k, c, t], probed_ray[k, c, t, j], i)
-                        row[6 + k] = weight * (moved - missed) / _PROBE
-                    row[6 + numbers] = weight * missed
-                for i in range(3):
-                    for k in range(3):
-                        for m in range(3):
-                            matrix[i, k] += by_joint[m, i] * by_joint[m, k]
-                    for m in range(3):
-                        row = rows[c, first + m]
-                        for k in range(6):
-                            both[first + i, 6 * c + k] += by_joint[m, i] * row[k]
-                        for k in range(numbers + 1):
-                            both[first + i, 6 * cameras + k] += by_joint[m, i] * row[6 + k]
-            _inverse(matrix, inverse)
-            for i in range(3):
-                for k in range(width):
-                    for m in range(3):
-                        solution[first + i, k] += inverse[i, m] * both[first + m, k]
-    return rows, both, solution
+    mixed = -rows[..., :3].mT @ rows  # a joint moves as the camera does, the other way
+    # Each camera has its own errors; the numbers are shared by all.
+    both = np.concatenate([*mixed[..., :6], mixed[..., 6:].sum(axis=0)], axis=-1)
+    both[..., -1] -= pull
+    matrix = (placed + _FIRM)[..., None, None] * np.eye(3) - mixed[..., :3].sum(axis=0)
+    solution = np.moveaxis(_inverse(np.moveaxis(matrix, (-2, -1), (0, 1))), (0, 1), (-2, -1)) @ both
+    width = both.shape[-1]
+    equations = -both.reshape(-1, width).T @ solution.reshape(-1, width)
+    for camera, own in enumerate(rows.reshape(len(rows), -1, rows.shape[-1])):
+        place = [*range(6 * camera, 6 * camera + 6), *range(6 * len(rows), width)]
+        equations[np.ix_(place, place)] += own.T @ own
+    return equations[:-1], solution[..., :-1]
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -333,32 +244,25 @@ def _step(
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
     cost = float((np.where(used, huber, 0.0) / seen).sum()) + strain
 
-    probed_place, probed_ray = np.zeros((len(numbers), *place.shape)), np.zeros((len(numbers), *missed.shape))
-    for k, probe in enumerate(_PROBE * np.eye(len(numbers))):
+    parts = [_by_errors(joints, place, solved.direction, missed)]
+    for probe in _PROBE * np.eye(len(numbers)):
         probed = _with_errors(make(numbers + probe), errors)
-        probed_ray[k] = np.where(used[..., None], _directions(probed), 0.0)
-        probed_place[k] = np.nan_to_num(probed.position)
-    # Each camera has its own errors; the numbers are shared by all; the joints are eliminated.
-    rows, both, solution = _linear(
-        joints, place, solved.direction, probed_place, probed_ray, np.sqrt(weight), placed, pull
-    )
+        ray = np.where(used[..., None], _directions(probed), 0.0)
+        moved, _ = _misses(joints, np.nan_to_num(probed.position), ray)
+        parts.append((moved - missed)[..., None] / _PROBE)
+    rows = np.concatenate([*parts, missed[..., None]], axis=-1) * np.sqrt(weight)[..., None, None]
+    equations, moved = _normal_equations(rows, placed, pull)
     # The person grows by what moves the joints away from their middle at each moment.
     known = np.isfinite(solved.joints).all(axis=2, keepdims=True)
     middle = joints.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
-    about = np.where(known, joints - middle, 0.0).ravel()
-    of_size = -(about @ solution[:, :-1]) / (max(float(about @ about), 1e-9) * SIZE_SIGMA)
-    coupled = both.T @ solution
-    normal, right = -coupled[:-1, :-1], -coupled[:-1, -1]
-    for camera in range(len(errors)):
-        product = rows[camera].T @ rows[camera]
-        place_of = [*range(6 * camera, 6 * camera + 6), *range(errors.size, unknowns)]
-        normal[np.ix_(place_of, place_of)] += product[:-1, :-1]
-        right[place_of] += product[:-1, -1]
+    about = np.where(known, joints - middle, 0.0)
+    of_size = -np.tensordot(about, moved, 3) / (max(float((about**2).sum()), 1e-9) * SIZE_SIGMA)
+    normal, right = equations[:, :-1], equations[:, -1]
     free = np.asarray(loose, dtype=np.float64)
     inverse = np.concatenate([1 / sigma.ravel() ** 2, 1 / free**2])
     normal += np.diag(inverse + 1e-9) + np.outer(of_size, of_size)
     right += inverse * np.concatenate([errors.ravel(), numbers]) + of_size * sized
-    covariance = np.linalg.inv(normal)
+    covariance: Float = np.asarray(np.linalg.inv(normal), np.float64)
     kept = errors.size if len(numbers) else 0
     return cost, strain, -covariance @ right, covariance[kept:, kept:]
 
@@ -434,22 +338,15 @@ class Score(NamedTuple):
     scatter: float  # of rays within pictures, over the pixel noise
     odd: dict[str, Oddity]
     stature_m: float
-
-
-class Base(NamedTuple):
-    """The described scene, against which others are scored."""
-
-    total: float
-    scatter: float
-    person_px: Float  # [C] as of the scene
-    covered: float  # share of joints and moments that two cameras see
+    person_px: Float = np.zeros(0)  # [C] as of the scene
+    covered: float = 0.0  # share of joints and moments that two cameras see
 
 
 @np.errstate(invalid="ignore", divide="ignore")
 def score(
     flight: Sampled,
     scene: SceneOfMoments,
-    base: Base | None = None,
+    base: Score | None = None,
     *,
     same_scatter: bool = False,
     limit: float = np.inf,
@@ -459,7 +356,7 @@ def score(
     Args:
         flight: its flight.
         scene: the scene.
-        base: the scene as described; None if it is that.
+        base: the score of the scene as described; None if it is that.
         same_scatter: True where an alternative can only seem to change the scatter, as a unit does.
         limit: a score above it need not be exact: what takes time is left out once that is certain.
     """
@@ -495,7 +392,8 @@ def score(
     odd |= _place(flight, scene, body, solved, stature)
     odd = {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
     total += sum(surprise(each) for each in odd.values())
-    return Score(total, misfit, scatter, odd | {"behind": behind, "unposed": unposed(scene)}, stature)
+    odd |= {"behind": behind, "unposed": unposed(scene)}
+    return Score(total, misfit, scatter, odd, stature, scene.person_px, float(good.mean()))
 
 
 def _loose_scale(scene: SceneOfMoments) -> float:
@@ -518,13 +416,6 @@ def unposed(scene: SceneOfMoments) -> Oddity:
     """
     share = min((float(each) for each in scene.unposed if np.isfinite(each)), default=0.0)
     return Oddity(min(share, _MOST_UNPOSED) / _UNPOSED_SIGMA, {"unposed_share": share})
-
-
-def base_of(flight: Sampled, scene: SceneOfMoments) -> tuple[Base, Score]:
-    """Score the scene as described; other scenes are scored against it."""
-    described = score(flight, scene)
-    covered = float((solve(scene).views >= 2).mean())
-    return Base(described.total, described.scatter, scene.person_px, covered), described
 
 
 def _misfit(solved: SolvedJoints, good: Bool) -> float:
@@ -566,16 +457,8 @@ def _scatter(scene: SceneOfMoments, solved: SolvedJoints) -> float:
 
 def _scatter_of_pair(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
     """Fit constant errors of both poses to the rays' distances, and measure what they leave."""
-    chosen, shape = list(pair), solved.seen.shape[1:]
-    used, design, apart, noise2 = _crossings(
-        solved.direction[chosen],
-        solved.depth[chosen],
-        solved.seen[chosen],
-        scene.position[chosen],
-        scene.rotation[chosen],
-        scene.sigma[chosen],
-        pixel_variance(scene)[chosen] / scene.focal_px[chosen] ** 2,
-    )
+    shape = solved.seen.shape[1:]
+    used, design, apart, noise2 = _crossings(scene, solved, pair)
     if len(used) < _FEWEST:
         return None
     noise = np.sqrt(median(noise2))
@@ -591,50 +474,32 @@ def _scatter_of_pair(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[in
     return float(1.48 * median(np.abs(residual - known_median(residual, 1)[:, None])) / noise)
 
 
-@cached
 def _crossings(
-    ray: Float, depth: Float, seen: Bool, place: Float, rotation: Float, sigma: Float, pixel2: Float
-) -> tuple[Int64, Float, Float, Float]:
-    """Compare the rays [2, T, J, 3] of two cameras along their common normals.
+    scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]
+) -> tuple[Index, Float, Float, Float]:
+    """Compare the rays of two cameras along their common normals.
 
     That distance changes by the normal with a shift of a camera, and by the lever (distance times ray) across
-    the normal with a turn; `pixel2` [2] rad^2 are variances of keypoints. Return indices [N] of joints whose
-    rays cross; the derivatives [N, 12] of their distances by shift and turn of each camera, in standard
-    deviations; the distances [N] m and their variances [N] m^2.
+    the normal with a turn. Return indices [N] of joints whose rays cross; the derivatives [N, 12] of their
+    distances by shift and turn of each camera, in standard deviations; the distances [N] m and their
+    variances [N] m^2.
     """
-    _, times, names = seen.shape
-    used, design = np.zeros(times * names, np.int64), np.zeros((times * names, 12))
-    apart, noise2, normal, count = np.zeros(times * names), np.zeros(times * names), np.zeros(3), 0
-    for t in range(times):
-        for j in range(names):
-            if not (seen[0, t, j] and seen[1, t, j]):
-                continue
-            a, b, length2 = ray[0, t, j], ray[1, t, j], 0.0
-            for i in range(3):
-                normal[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]
-                length2 += normal[i] ** 2
-            if length2 <= _PARALLEL**2:
-                continue
-            normal /= np.sqrt(length2)
-            used[count] = t * names + j
-            for i in range(3):
-                apart[count] += normal[i] * (place[1, t, i] - place[0, t, i])
-            for c in range(2):
-                sign, away = 2 * c - 1, min(max(abs(depth[c, t, j]), 1e-4), 1e5)
-                for i in range(3):
-                    one, other = (i + 1) % 3, (i + 2) % 3
-                    lever = ray[c, t, j, one] * normal[other] - ray[c, t, j, other] * normal[one]
-                    design[count, 6 * c + i] = sign * sigma[c, 0] * normal[i]
-                    for k in range(3):
-                        design[count, 6 * c + 3 + k] += (
-                            sign * sigma[c, 1] * away * lever * rotation[c, t, i, k]
-                        )
-                noise2[count] += away**2 * pixel2[c]
-                # What is new in every pose turns the person in the picture, besides moving them.
-                noise2[count] += (_HALF_BODY_M * sigma[c, 3]) ** 2
-                noise2[count] += (_HALF_BODY_M * sigma[c, 2] / max(away, 1.0)) ** 2
-            count += 1
-    return used[:count], design[:count], apart[:count], noise2[:count]
+    normal = np.cross(solved.direction[pair[0]], solved.direction[pair[1]])
+    sine = np.linalg.norm(normal, axis=-1)
+    used = np.nonzero(solved.seen[list(pair)].all(axis=0) & (sine > _PARALLEL))
+    normal = normal[used] / sine[used][:, None]
+    between = scene.position[pair[1]] - scene.position[pair[0]]
+    parts, noise2 = [], np.zeros(len(normal))
+    for camera, sign in zip(pair, (-1, 1), strict=True):
+        away = np.clip(np.abs(solved.depth[camera][used]), 1e-4, 1e5)
+        lever = np.cross(solved.direction[camera][used], normal)[:, None] @ scene.rotation[camera, used[0]]
+        place, turn, new_place, new_turn = scene.sigma[camera, :4]
+        parts += [sign * place * normal, sign * turn * away[:, None] * lever[:, 0]]
+        noise2 += away**2 * pixel_variance(scene)[camera] / scene.focal_px[camera] ** 2
+        # What is new in every pose turns the person in the picture, besides moving them.
+        noise2 += (_HALF_BODY_M * new_turn) ** 2 + (_HALF_BODY_M * new_place / np.maximum(away, 1.0)) ** 2
+    apart = (between[used[0]] * normal).sum(axis=-1)
+    return np.ravel_multi_index(used, sine.shape), np.hstack(parts), apart, noise2
 
 
 def _place(
@@ -694,8 +559,7 @@ def _spread(values: Float) -> float:
 def residuals_px(scene: SceneOfMoments) -> list[float]:
     """Return the median distances (px) of keypoints from their joints: of all, then by camera."""
     solved = solve(scene)
-    toward = solved.joints[None] - np.nan_to_num(scene.position)[:, :, None, :]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        across = np.linalg.norm(np.cross(solved.direction, toward), axis=-1) / np.abs(solved.depth)
-    pixels = np.where(solved.seen, across * scene.focal_px[:, None, None], np.nan)
+    missed, _ = _misses(solved.joints, np.nan_to_num(scene.position), solved.direction)
+    pixels = np.linalg.norm(missed, axis=-1) * scene.focal_px[:, None, None]
+    pixels = np.where(solved.seen, pixels, np.nan)
     return [round(median(each), 2) for each in (pixels, *pixels)]
