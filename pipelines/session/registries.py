@@ -39,16 +39,23 @@ from pipelines.session.yaml_models import YamlModel
 T = TypeVar("T")
 
 
-class Format(Protocol):
-    """A foreign file format. Its reading method depends on its kind (the protocols below)."""
+class Named(Protocol):
+    """An extension with a name for commands and files, and one for people."""
 
     @property
     def name(self) -> str:
-        """The name that the user writes after `format:`."""
+        """The name that the user writes: after `format:`, `--detector` (with an argument) or `--to`.
+
+        Of a detector, this and the model files together determine the results.
+        """
 
     @property
     def title(self) -> str:
-        """The name that `mocap info` prints."""
+        """The name, or line of help, that commands print."""
+
+
+class Format(Named, Protocol):
+    """A foreign file format. Its reading method depends on its kind (the protocols below)."""
 
     @property
     def suffixes(self) -> tuple[str, ...]:
@@ -208,16 +215,8 @@ class KeypointNetworks(Protocol):
         """Locate the joints of one person in each region; `presence` says if there is one at all."""
 
 
-class Detector(Protocol):
+class Detector(Named, Protocol):
     """A keypoint detector."""
-
-    @property
-    def name(self) -> str:
-        """The text after `--detector`, without paths. Name and model files together determine the results."""
-
-    @property
-    def title(self) -> str:
-        """The name that `mocap models` prints."""
 
     def models(self) -> dict[str, Path | None]:
         """List the files that it needs: name to path, None for those that are missing."""
@@ -247,16 +246,8 @@ class MeasuredDetector(Detector, Protocol):
 
 
 @runtime_checkable
-class DetectorFamily(Protocol):
+class DetectorFamily(Named, Protocol):
     """Detectors with an argument after a colon that says which model to run: `--detector NAME:ARGUMENT`."""
-
-    @property
-    def name(self) -> str:
-        """The name that the user writes before the colon."""
-
-    @property
-    def title(self) -> str:
-        """The name that `mocap models` prints."""
 
     @property
     def usage(self) -> str:
@@ -266,16 +257,8 @@ class DetectorFamily(Protocol):
         """Return the detector for an argument. A DataError says what is wrong with the argument."""
 
 
-class Export(Protocol):
+class Export(Named, Protocol):
     """A format in which sessions are exported."""
-
-    @property
-    def name(self) -> str:
-        """The name that the user writes after `--to`."""
-
-    @property
-    def title(self) -> str:
-        """The line for the help text."""
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write into an existing empty folder and return the paths written, sorted.

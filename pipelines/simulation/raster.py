@@ -176,7 +176,15 @@ def projected(
 
 def bands(triangles: Projected, height: int, rows: int) -> tuple[Int32, NDArray[np.int64]]:
     """Find the triangles [M] of each band of `rows` pixel rows, and the start [B + 1] of each band."""
-    return _sorted_into_bands(triangles.corners, height, rows)
+    top, bottom = (of(triangles.corners[..., 1], axis=1) for of in (np.min, np.max))
+    # A pixel row reaches half a pixel above and below its centre.
+    first = (np.maximum(top + 0.5, 0.0) / rows).astype(np.int64)
+    last = (np.minimum(bottom + 0.5, height - 0.5) / rows).astype(np.int64)
+    touched = np.maximum(last + 1 - first, 0)
+    triangle = np.repeat(np.arange(len(first), dtype=np.int32), touched)
+    band = np.arange(len(triangle)) - np.repeat(np.cumsum(touched) - touched - first, touched)
+    start = np.searchsorted(np.sort(band), np.arange((height + rows - 1) // rows + 1))
+    return triangle[np.argsort(band, kind="stable")], start.astype(np.int64)
 
 
 def empty_band(sample_rows: int, width: int) -> Band:
@@ -289,31 +297,6 @@ def _clipped(points: Float, faces: Int32, pinhole: Float, width: float, height: 
             source[count] = f
             count += 1
     return corners[:count], source[:count]
-
-
-@cached
-def _sorted_into_bands(corners: Float, height: int, rows: int) -> tuple[Int32, NDArray[np.int64]]:
-    count = (height + rows - 1) // rows
-    first = np.empty(len(corners), np.int32)
-    last = np.empty(len(corners), np.int32)
-    start = np.zeros(count + 1, np.int64)
-    for t in range(len(corners)):
-        top = min(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1])
-        bottom = max(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1])
-        # A pixel row reaches half a pixel above and below its centre.
-        first[t] = int(max(top + 0.5, 0.0) / rows)
-        last[t] = int(min(bottom + 0.5, height - 0.5) / rows)
-        for band in range(first[t], last[t] + 1):
-            start[band + 1] += 1
-    for band in range(count):
-        start[band + 1] += start[band]
-    chosen = np.empty(start[count], np.int32)
-    filled = start[:-1].copy()
-    for t in range(len(corners)):
-        for band in range(first[t], last[t] + 1):
-            chosen[filled[band]] = t
-            filled[band] += 1
-    return chosen, start
 
 
 # --- fragments -----------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.compute as pc
 
-from pipelines.formats.common.files import read_head
+from pipelines.formats.common.files import TextFormat, read_head
 from pipelines.formats.common.rows import (
     METRES,
     Heading,
@@ -41,19 +41,15 @@ _ATTITUDE = {"qw", "q_w", "yaw", "pitch", "roll"}
 
 
 @dataclass(frozen=True)
-class PlaceTrack:
+class PlaceTrack(TextFormat):
     """Reader of places: `is_known` recognises the beginning of a file, `read` returns its rows."""
 
-    name: str
-    title: str
-    suffixes: tuple[str, ...]
-    is_known: Callable[[str], bool]
     read: Callable[[Path], tuple[Int64, Bool, Float, bool]]
     """Times [N], if they are known [N], places [N, 3], and True for degrees and metres of height."""
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins as such files do."""
-        return self.is_known(read_head(path, self.suffixes)) and not DJI_RECORD.recognises(path)
+        return super().recognises(path) and not DJI_RECORD.recognises(path)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times and losses."""
