@@ -302,48 +302,41 @@ def _is_strange(described: Score) -> bool:
 
 
 class Tried(NamedTuple):
-    """An alternative, and how well it fits."""
+    """An alternative, and how well it fits; the objective has two parts, the score and the rays."""
 
     alternative: Alternative
     score: Score | None = None  # None of what is seen directly
     cost: float = np.inf  # of what is fitted: chi^2 of the rays, and what the numbers cost
-    misfits: tuple[float, float] = (np.nan, np.nan)  # the objective of the description, and with this change
     numbers: int = 0  # how many were fitted
+    before: tuple[float, float] = (np.inf, np.inf)  # the objective of the description
+    after: tuple[float, float] = (-np.inf, -np.inf)  # and with this change and its price
 
     @property
     def total(self) -> float:
         """The score with the price; what is seen directly, without a scene, wins over everything."""
         return -np.inf if self.score is None else self.score.total + self.alternative.price
 
-
-class Compared(NamedTuple):
-    """The two parts of the objective, of the description and of an alternative with its price."""
-
-    score_before: float
-    score_after: float
-    rays_before: float
-    rays_after: float
-
     @property
     def gain(self) -> float:
         """By how much the alternative lowers the objective, beyond its price."""
-        return self.score_before - self.score_after + self.rays_before - self.rays_after
+        return sum(self.before) - sum(self.after)
 
-    def is_enough(self, alternative: Alternative, odd: bool) -> bool:
+    def is_enough(self, odd: bool) -> bool:
         """Test if the gain is more than chance.
 
         People who lie or stand look alike at all times. So where nothing is odd, and of times of all cameras,
         the rays alone must tell it; of times of one camera, they must fit as well, or tell it if nothing else
         does.
         """
-        if alternative.code in TIMES:
-            by_score = self.score_before - self.score_after >= LEAST_GAIN_OF_TIMES
-            least = -_ALIKE if by_score and not alternative.alike else MARGIN
+        by_score, by_rays = np.subtract(self.before, self.after)
+        if self.alternative.code in TIMES:
+            is_scored = by_score >= LEAST_GAIN_OF_TIMES
+            least = -_ALIKE if is_scored and not self.alternative.alike else MARGIN
         else:
             least = -np.inf if odd else MARGIN
         # Whoever is far too tall or small is doubted anyway.
-        margin = 0.0 if alternative.code == "scale" else MARGIN
-        return self.gain >= margin and self.rays_before - self.rays_after >= least
+        margin = 0.0 if self.alternative.code == "scale" else MARGIN
+        return self.gain >= margin and bool(by_rays >= least)
 
 
 class Objective:
@@ -480,15 +473,15 @@ class Objective:
         """Return the deviation of the chi^2 where moments are of other pictures, with other errors."""
         return cost * float(np.sqrt(2 * self._pictures[cameras].sum()) / self._pictures.sum())
 
-    def compared(self, tried: Tried) -> Compared:
-        """Return the objective of the description, and that of an alternative with its price.
+    def compared(self, tried: Tried) -> Tried:
+        """Compare an alternative and its price with the description.
 
         Other times leave moments and pictures out: then the description is judged by the same ones, since
         those left out may show somebody else. Larger errors excuse everything: of them only the chi^2 counts.
         """
         scene, described = tried.alternative.scene, self.trial.described
         if scene is None or tried.score is None:
-            return Compared(np.inf, -np.inf, np.inf, -np.inf)
+            return tried
         before, total = self.described.cost, self.base.total
         if tried.alternative.code in (*TIMES, "videos_swapped"):
             same = self._at_moments_of(scene)
@@ -502,7 +495,8 @@ class Objective:
             chance = sigmas * self._chance(before, others)
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
-        return Compared(*scores, self._rays(before, described), self._rays(cost, scene))
+        rays = (self._rays(before, described), self._rays(cost, scene))
+        return tried._replace(before=(scores[0], rays[0]), after=(scores[1], rays[1]))
 
 
 def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> tuple[list[Tried], float]:
@@ -512,33 +506,24 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> tuple[li
     something odd is no cause. Also return the most that any alternative lowers the objective by.
     """
     by_score = sorted((each for each in tried if not np.isfinite(each.cost)), key=lambda each: each.total)
-    known, weighed = [], []
-    for each in [*by_score[:_FITTED], *(each for each in tried if np.isfinite(each.cost))]:
-        found = objective.compared(each)
-        known.append((found.gain, each.alternative))
-        if found.is_enough(each.alternative, odd):
-            misfits = (found.score_before + found.rays_before, found.score_after + found.rays_after)
-            weighed.append((found.gain, each._replace(misfits=misfits)))
-    weighed.sort(key=lambda pair: -pair[0])
-    causes: list[tuple[float, Tried]] = []
-    for gain, each in weighed:
-        if causes and gain < causes[0][0] - _ALIKE:
+    fitted = [each for each in tried if np.isfinite(each.cost)]
+    known = [objective.compared(each) for each in [*by_score[:_FITTED], *fitted]]
+    weighed = sorted((each for each in known if each.is_enough(odd)), key=lambda each: -each.gain)
+    causes: list[Tried] = []
+    for each in weighed:
+        if causes and each.gain < causes[0].gain - _ALIKE:
             break
         if _leaves_no_doubt(objective.trial.flight, each.alternative):
-            causes.append((gain, each))
-    simplest: dict[str, tuple[float, Tried]] = {}
-    for gain, each in sorted(causes, key=lambda pair: pair[1].numbers):
-        simplest.setdefault(each.alternative.code, (gain, each))
-    by_gain = sorted(simplest.values(), key=lambda pair: (pair[1].numbers > 0, -pair[0]))
-    told = [
-        each._replace(alternative=_of_either(objective.trial, each, gain, known)) for gain, each in by_gain
-    ]
-    return told, max((gain for gain, _ in weighed), default=0.0)
+            causes.append(each)
+    simplest: dict[str, Tried] = {}
+    for each in sorted(causes, key=lambda each: each.numbers):
+        simplest.setdefault(each.alternative.code, each)
+    by_gain = sorted(simplest.values(), key=lambda each: (each.numbers > 0, -each.gain))
+    told = [each._replace(alternative=_of_either(objective.trial, each, known)) for each in by_gain]
+    return told, weighed[0].gain if weighed else 0.0
 
 
-def _of_either(
-    trial: Trial, cause: Tried, gain: float, known: Sequence[tuple[float, Alternative]]
-) -> Alternative:
+def _of_either(trial: Trial, cause: Tried, known: Sequence[Tried]) -> Alternative:
     """Return a cause of one of two cameras; as one of both, if the other's would explain about as much.
 
     Then no remedy is sure. Where nothing else places the flight, one log is placed beside the other: the
@@ -550,9 +535,10 @@ def _of_either(
         return own
     beside = own.code == "origin" and trial.is_loose_pair
     alike = (
-        _leaves_no_doubt(trial.flight, each)
-        for its, each in known
-        if each.code == own.code and each.cameras == other and gain - its < MARGIN
+        _leaves_no_doubt(trial.flight, each.alternative)
+        for each in known
+        if (each.alternative.code, each.alternative.cameras) == (own.code, other)
+        and cause.gain - each.gain < MARGIN
     )
     if not beside and not any(alike):
         return own
@@ -688,8 +674,8 @@ def _doubt(trial: Trial, cause: Tried, described: Score, codes: Sequence[str]) -
         }
     evidence |= alternative.evidence
     told: dict[str, float | dict[str, float]] = {k: v for k, v in evidence.items() if np.isfinite(v)}
-    if np.isfinite(cause.misfits).all():
-        before, after = (round(value, 2) for value in cause.misfits)
+    if np.isfinite(cause.gain):
+        before, after = (round(sum(parts), 2) for parts in (cause.before, cause.after))
         told["tried"] = {"misfit_before": before, "misfit_after": after, "doubts_after": 0}
     return Doubt(
         code=alternative.code,
