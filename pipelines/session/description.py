@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pipelines.geometry.arrays import ClockFit, Intrinsics, Place
 from pipelines.session.errors import DataError
 from pipelines.session.records import HeldMap
-from pipelines.session.storage import hash_of, read_json, refuse_camera_names, refuse_newer
+from pipelines.session.storage import hash_of, read_json, refuse_names, refuse_newer
 
 
 class Entry(BaseModel):
@@ -330,7 +330,7 @@ class Description(Entry):
     @model_validator(mode="after")
     def _names_are_of_cameras(self) -> Self:
         """Refuse names that are unsafe as folders: those of a foreign session must not lead out of it."""
-        refuse_camera_names(self.cameras)
+        refuse_names(self.cameras, "camera")
         named = [self.clock_reference, *(self.plan or {}), *(self.truth.cameras if self.truth else [])]
         strange = [name for name in named if name not in self.cameras]
         if strange:

@@ -37,7 +37,7 @@ from pipelines.session.registries import (
     TelemetryFormat,
     TrajectoryFormat,
 )
-from pipelines.session.storage import refuse_camera_names, refuse_names_of_people
+from pipelines.session.storage import refuse_names
 from pipelines.session.yaml_files import read_yaml_model
 from pipelines.session.yaml_models import SecondsAsNs, YamlModel, describe_problem, nanoseconds, unknown_key
 
@@ -653,8 +653,8 @@ class Manifest(YamlModel):
 
     @model_validator(mode="after")
     def _names_exist(self) -> Manifest:
-        refuse_camera_names(self.cameras)
-        refuse_names_of_people(self.actors)
+        refuse_names(self.cameras, "camera")
+        refuse_names(self.actors, "person")
         if self.actor is not None and self.actors:
             raise ValueError("actor and actors: leave one of them out")
         if self.logged_people and not any(actor.weight for actor in self.logged_people.values()):

@@ -16,7 +16,7 @@ import stat
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -57,25 +57,15 @@ def as_data_error(error: OSError, path: Path) -> DataError:
     return DataError(error.filename or path, error.strerror or str(error), remedy, code=code)
 
 
-def refuse_camera_names(names: Collection[str]) -> None:
-    """Refuse, with a ValueError, camera names that cannot each name their own folder."""
-    bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
-    if bad:
-        raise ValueError(f"camera name {bad[0]!r}: use 1 to 64 of A-Z a-z 0-9 _ -, it names a folder")
+def refuse_names(names: Collection[str], of: Literal["camera", "person"]) -> None:
+    """Refuse, with a ValueError, names that cannot be of files each, or that unnamed people have."""
+    for name in names:
+        if not CAMERA_NAME.fullmatch(name):
+            raise ValueError(f"name {name!r} of a {of}: use 1 to 64 of A-Z a-z 0-9 _ -, it names files")
+        if of == "person" and name.lower().startswith("person") and name[6:].isdigit():
+            raise ValueError(f"name {name!r} of a person: people without a log are called so")
     if len({name.lower() for name in names}) < len(names):
-        raise ValueError("two cameras differ in case only: their folders would be one on some systems")
-
-
-def refuse_names_of_people(names: Collection[str]) -> None:
-    """Refuse, with a ValueError, names that cannot be parts of file names, or that unnamed people have."""
-    bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
-    if bad:
-        raise ValueError(f"name {bad[0]!r} of a person: use 1 to 64 of A-Z a-z 0-9 _ -, it is in file names")
-    taken = [name for name in names if name.lower().startswith("person") and name[6:].isdigit()]
-    if taken:
-        raise ValueError(f"name {taken[0]!r} of a person: people without a log are called so")
-    if len({name.lower() for name in names}) < len(names):
-        raise ValueError("two people differ in case only: their files would be one on some systems")
+        raise ValueError(f"names of a {of} differ in case only: their files would be one on some systems")
 
 
 # The largest JSON that mocap writes is the metrics of an eight-hour flight, of some megabytes.

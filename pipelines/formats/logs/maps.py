@@ -7,7 +7,7 @@ map is in memory.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -72,15 +72,6 @@ class LoggedMaps:
 
 class _EmptyMapError(Exception):
     """Error for a map without any known cell."""
-
-
-@dataclass(frozen=True)
-class _Change:
-    """Map that differs from the one before."""
-
-    row: int  # of its message
-    t_ns: int
-    voxels: int
 
 
 def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic) -> LoggedMaps:
@@ -165,7 +156,7 @@ def _place_at(t_ns: int, about: MapTopic) -> Pose | None:
 
 def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedMaps:
     lost = Losses(about.source)
-    changes: list[_Change] = []
+    changes: list[tuple[int, int, int]] = []  # row and time of the message, voxels
     only: Occupancy | None = None  # the first map, while there is no other
     last, newest_ns, repeated = b"", -(2**62), 0
     for row, message in enumerate(read()):
@@ -188,11 +179,11 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
         else:
             only = None if changes else made
             last, newest_ns = digest, made.from_ns
-            changes.append(_Change(row, made.from_ns, made.probability.size))
+            changes.append((row, made.from_ns, made.probability.size))
     if not changes:
         raise lost.nothing_usable()
     notes = lost.notes()
-    most = max(1, min(MOST_MAPS, MOST_VOXELS // max(change.voxels for change in changes)))
+    most = max(1, min(MOST_MAPS, MOST_VOXELS // max(voxels for _, _, voxels in changes)))
     kept = [changes[row] for row in evenly(len(changes), most)]
     if len(kept) < len(changes):
         lost.counts[NOT_KEPT] += len(changes) - len(kept)
@@ -208,8 +199,8 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
         notes.append(
             f"{about.source}: {len(kept)} maps that follow each other ({repeated} repeat the one before)"
         )
-    maps = iter([only]) if only is not None else _made_again(read, about, kept)
-    return LoggedMaps(maps, np.array([change.t_ns for change in kept], np.int64), dict(+lost.counts), notes)
+    maps = iter([only]) if only is not None else _made_again(read, about, {row for row, _, _ in kept})
+    return LoggedMaps(maps, np.array([t_ns for _, t_ns, _ in kept], np.int64), dict(+lost.counts), notes)
 
 
 def _made(message: Message, about: MapTopic) -> Occupancy | None:
@@ -233,9 +224,8 @@ def _one_line(about: MapTopic) -> Iterator[None]:
 
 
 def _made_again(
-    read: Callable[[], Iterator[Message]], about: MapTopic, changes: list[_Change]
+    read: Callable[[], Iterator[Message]], about: MapTopic, rows: Set[int]
 ) -> Iterator[Occupancy]:
-    rows = {change.row for change in changes}
     for row, message in enumerate(read()):
         if row in rows:
             made = _made(message, about)

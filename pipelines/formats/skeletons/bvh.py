@@ -71,13 +71,6 @@ class _FileBone:
     end: Float | None = None
 
 
-@dataclass(frozen=True)
-class _BvhFile:
-    bones: list[_FileBone]
-    frame_time_s: float
-    values: Float  # [T, C]
-
-
 class BvhFormat:
     """Reader of the joints at which bones begin, by our names where known (LeftUpLeg is left_hip)."""
 
@@ -95,22 +88,22 @@ class BvhFormat:
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
         """Read every frame, y up unless stated, in the unit that makes the rest pose an adult."""
-        contents = _read(path)
+        bones, frame_time_s, values = _read(path)
         axes = axes or "y-up"
-        metres = {**METRES, "ft": 0.3048}[unit] if unit else _likely_unit(path, contents.bones, axes)
+        metres = {**METRES, "ft": 0.3048}[unit] if unit else _likely_unit(path, bones, axes)
         joints: list[Float] = []
         turned: list[Float] = []
-        for bone in contents.bones:
-            place, _ = _bone_places(bone, contents.values)
-            own = _rotation(bone, contents.values)
+        for bone in bones:
+            place, _ = _bone_places(bone, values)
+            own = _rotation(bone, values)
             if bone.parent >= 0:
                 place = joints[bone.parent] + rotate(turned[bone.parent], place)
                 own = multiply(turned[bone.parent], own)
             joints.append(place)
             turned.append(own)
         position = np.stack(joints, axis=1)[..., _IN_WORLD[axes]] * metres
-        t_ns = np.rint(np.arange(len(position)) * (contents.frame_time_s * 1e9)).astype(np.int64)
-        return JointMotion(t_ns, bone_joints(tuple(bone.name for bone in contents.bones)), position[:, None])
+        t_ns = np.rint(np.arange(len(position)) * (frame_time_s * 1e9)).astype(np.int64)
+        return JointMotion(t_ns, bone_joints(tuple(bone.name for bone in bones)), position[:, None])
 
 
 def _likely_unit(path: Path, bones: list[_FileBone], axes: str) -> float:
@@ -137,21 +130,21 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
     if axes not in AXES:
         problem = f"the axes {axes!r} are none of {', '.join(AXES)}"
         raise DataError(path, problem, "state one of them", code="axes-unknown")
-    contents = _read(path)
+    bones, frame_time_s, values = _read(path)
     metres, order = METRES[unit], _IN_WORLD[axes]
     turned = [*order, 3]  # a rotation's axis is turned like any other vector
     places, rotations = [], []
-    for bone in contents.bones:
-        place, moves = _bone_places(bone, contents.values)
+    for bone in bones:
+        place, moves = _bone_places(bone, values)
         places.append((place[:, order] * metres, moves))
-        rotations.append(_rotation(bone, contents.values)[:, turned])
-    first = _carriers(contents.bones, [moves for _, moves in places])
+        rotations.append(_rotation(bone, values)[:, turned])
+    first = _carriers(bones, [moves for _, moves in places])
     root, root_rotation = places[0][0], rotations[0]
     for k in range(1, first + 1):
         root = root + rotate(root_rotation, places[k][0])
         root_rotation = multiply(root_rotation, rotations[k])
     rotations[first] = root_rotation
-    kept = contents.bones[first:]
+    kept = bones[first:]
     offsets = [np.zeros(3)]
     offsets += [
         _fixed_place(path, bone, place)
@@ -159,7 +152,7 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
     ]
     ends = {k: bone.end[order] * metres for k, bone in enumerate(kept) if bone.end is not None}
     return SkeletalMotion(
-        t_s=np.arange(len(contents.values), dtype=np.float64) * contents.frame_time_s,
+        t_s=np.arange(len(values), dtype=np.float64) * frame_time_s,
         bones=tuple(bone.name for bone in kept),
         parent=tuple(max(bone.parent - first, -1) for bone in kept),
         offset=np.array(offsets),
@@ -234,7 +227,8 @@ def _rest_places(bones: list[_FileBone]) -> Float:
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
 
 
-def _read(path: Path) -> _BvhFile:
+def _read(path: Path) -> tuple[list[_FileBone], float, Float]:
+    """Return the bones, the time of a frame (s), and the values [T, C] of all channels."""
     text = read_text(path)
     head, marker, tail = text.partition("\nMOTION")
     if not head.lstrip().startswith("HIERARCHY"):
@@ -251,7 +245,7 @@ def _read(path: Path) -> _BvhFile:
         problem = f"states {frames:g} frames but holds {len(values)}"
         remedy = _EXPORT_AGAIN if len(values) < frames else "correct the line `Frames:`"
         raise DataError(path, problem, remedy, code="damaged")
-    return _BvhFile(bones, frame_time_s, values)
+    return bones, frame_time_s, values
 
 
 def _bones(path: Path, words: list[str]) -> list[_FileBone]:

@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,26 +39,20 @@ _PADDING = " \t\r\"'\0"
 _FRAMES_AT_ONCE = 1000
 
 
-@dataclass(frozen=True)
-class _TrcHeader:
-    keys: dict[str, str]
-    markers: tuple[str, ...]
-
-
 def _read(path: Path, unit: str | None, axes: str | None) -> JointMotion:
     """Read every row of one person; a stated `unit` overrides the header: files in mm often claim m."""
-    header, rows, first_line = _split(path, read_text(path))
-    times, values = _numbers(path, rows, len(header.markers), first_line)
+    keys, markers, rows = _split(path, read_text(path))
+    times, values = _numbers(path, rows, len(markers))
     t_ns, readable = parse_stamps(path, times)
     if not readable.all() or (np.diff(t_ns) <= 0).any():
         bad = np.flatnonzero(~readable | (np.diff(t_ns, prepend=t_ns[0] - 1) <= 0))
         raise damaged(path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase")
-    position = to_metres_z_up(path, values, unit or metric_unit(header.keys.get("units", "")), axes or "y-up")
-    return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
+    position = to_metres_z_up(path, values, unit or metric_unit(keys.get("units", "")), axes or "y-up")
+    return JointMotion(t_ns=t_ns, joints=joint_names(markers), position=position[:, None])
 
 
-def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
-    """Return the header, the lines below it, and the line number of the first of those in the file."""
+def _split(path: Path, text: str) -> tuple[dict[str, str], tuple[str, ...], list[str]]:
+    """Return the header's keys and markers, and the lines below its five."""
     lines = text.split("\n")
     if len(lines) < 5 or not lines[0].startswith("PathFileType") or not re.match(_FRAME, lines[3]):
         problem = "has no TRC header (five lines from PathFileType to X1 Y1 Z1)"
@@ -72,22 +66,18 @@ def _split(path: Path, text: str) -> tuple[_TrcHeader, list[str], int]:
         problem = f"names the marker {twice[0]} more than once"
         raise DataError(path, problem, "rename one", code="stated-twice")
     keys = zip(lines[1].split("\t"), lines[2].split("\t"), strict=False)
-    return (
-        _TrcHeader({key.strip().lower(): value.strip(_PADDING) for key, value in keys}, markers),
-        lines[5:],
-        6,
-    )
+    return {key.strip().lower(): value.strip(_PADDING) for key, value in keys}, markers, lines[5:]
 
 
-def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tuple[list[str], Float]:
+def _numbers(path: Path, lines: list[str], markers: int) -> tuple[list[str], Float]:
     times: list[str] = []
     values: list[list[float]] = []
     decimal_commas = not any("." in line for line in lines[:10])
-    for number, line in enumerate(lines, start=first_line):
+    for number, line in enumerate(lines, start=6):  # behind the header
         if not line.strip():
             continue
         cells = (line.replace(",", ".") if decimal_commas else line).split("\t")
-        last = number == first_line + len(lines) - 1  # without its end of line: perhaps broken off
+        last = number == 5 + len(lines)  # without its end of line: perhaps broken off
         while len(cells) % 3 != 2 and not cells[-1].strip():
             cells.pop()  # many writers end their lines with a tab
         if 2 < len(cells) < 3 * markers + 2 and len(cells) % 3 == 2 and not last:
