@@ -91,8 +91,10 @@ _MIN_DURATION_S = 0.5
 _MIN_MESSAGES = 5
 # So many of the messages before and after lie nearer to their own median than to the other one.
 _SEPARATED_SHARE = 0.9
-# A log with more gaps loses messages all the time, and its gaps say nothing of clocks.
+# A log with more gaps loses messages all the time. Its gaps say nothing of clocks, other than so many that
+# are longer than the next one by this factor: two messages in a row are lost far less often than one.
 _MOST_GAPS = 3
+_DISTINCT_GAP = 1.75
 # A mean velocity over less time is mostly noise.
 _VELOCITY_S = 0.2
 # Drones that film people accelerate by less, in m/s^2; as rotation, this many parts of a quaternion per s^2.
@@ -153,7 +155,7 @@ def find_steps(header_ns: Int64, receive_ns: Int64) -> list[ClockStep]:
             and abs(own_s - step_s) < abs(step_s) / 2
             and abs(near_s - step_s) < abs(step_s) / 4 + 2 * near_sigma_s
             and pause_s < 3 * usual_s + abs(step_s) / 2  # the receipt goes on
-            and uneven_s < abs(step_s) / 4
+            and uneven_s < abs(step_s) / 3
             and lasted_s > _MIN_DURATION_S / 2  # messages of a queue arrive at once
             and (is_even or np.quantile(off, _SEPARATED_SHARE) < abs(step_s) / 2)
         ):
@@ -277,7 +279,9 @@ def find_gaps(stamps_ns: Int64) -> list[StampGap]:
     least_s = max(_MIN_STEP_S, _SIGNIFICANT_STEP_SIGMAS * 1.4826 * float(np.median(np.abs(off_s))))
     found = []
     for places in (np.flatnonzero(off_s < -least_s), np.flatnonzero(off_s > least_s)):
-        for k in places.tolist() if len(places) <= _MOST_GAPS else []:
+        lengths = np.sort(np.abs(off_s[places]))
+        usual = _DISTINCT_GAP * lengths[-_MOST_GAPS - 1] if len(places) > _MOST_GAPS else 0.0
+        for k in places[np.abs(off_s[places]) >= usual].tolist():
             before_s, after_s = off_s[max(k - 2 * _MIN_MESSAGES, 0) : k], off_s[k + 1 :][: 2 * _MIN_MESSAGES]
             around = np.abs(np.concatenate([before_s, after_s]))
             # A late message is followed by a shorter interval, and the step of a clock is not.

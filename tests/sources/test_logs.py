@@ -105,6 +105,12 @@ def test_a_step_of_all_clocks_of_a_log_is_taken_out(
     assert [f"{step_s:+.3f} s at " in note for note in notes] == [True, True]  # of the recorder, the header
 
 
+def test_a_step_among_nine_lost_messages_of_each_topic_is_taken_out(tmp_path: Path) -> None:
+    some = [each for k, each in enumerate(entries(300_000_000, together=True)) if k % 13]
+    poses, _ = trajectory(write_log(tmp_path, "log", "mcap-cdr", some))
+    np.testing.assert_array_equal(poses.t_ns, np.delete(TIMES_NS, np.arange(0, 120, 13)))
+
+
 @pytest.mark.parametrize("step_s", [0.2, 1.0])
 def test_a_step_of_all_clocks_that_nothing_shows_is_noted(tmp_path: Path, step_s: float) -> None:
     still = entries(round(step_s * 1e9), together=True, speed_m=0.0)

@@ -342,16 +342,18 @@ def _rows(subtitles: Subtitles) -> tuple[DjiRows, list[str]]:
 
 def _columns(texts: Sequence[str]) -> dict[str, Float]:
     """Return all columns of `_COLUMNS`, [B] each, NaN if a subtitle does not hold the value."""
-    rows = [_fields(text) for text in texts]
-    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
+    columns = {name: np.full(len(texts), np.nan) for name in _COLUMNS}
+    for row, text in enumerate(texts):
+        for name in (fields := _fields(text)).keys() & columns:
+            columns[name][row] = fields[name]
+    return columns
 
 
 def _fields(text: str) -> dict[str, float]:
     fields: dict[str, float] = {}
-    for bracket in _BRACKETS.findall(text):
-        for key, number in _PAIR.findall(bracket):
-            name = key.lower()
-            fields[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number.replace(",", "."))
+    for key, number in _PAIR.findall("]".join(_BRACKETS.findall(text))):
+        name = key.lower()
+        fields[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number.replace(",", "."))
     if "GPS" in text and (gps := _GPS.search(text)):
         first, second, third = (float(part) for part in gps.groups()[:3])
         if gps[4]:  # the M of a height: only this form begins with the latitude

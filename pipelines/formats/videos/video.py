@@ -83,22 +83,9 @@ class VideoContainer:
     name = "video"
     title = "video"
     suffixes: tuple[str, ...] = (
-        *(
-            ".mp4",
-            ".mov",
-            ".m4v",
-            ".mkv",
-            ".webm",
-            ".avi",
-            ".ts",
-            ".mts",
-            ".m2ts",
-            ".flv",
-            ".ogv",
-            ".ogg",
-            ".ivf",
-        ),
-        *(".mpg", ".mpeg", ".vob", ".wmv", ".asf", ".nut", ".y4m", ".mxf"),
+        *(".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts"),
+        *(".flv", ".ogv", ".ogg", ".ivf", ".mpg", ".mpeg", ".vob", ".wmv", ".asf"),
+        *(".nut", ".y4m", ".mxf"),
         *(suffix for _, suffixes in _RAW.values() for suffix in suffixes),
     )
 
