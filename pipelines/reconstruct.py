@@ -140,7 +140,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=46)
+RECONSTRUCT = Stage("reconstruct", revision=47)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -609,9 +609,8 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     flight.waiting.release()
     truth = None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns)
     names = [camera.name for camera in cameras]
-    metrics = assess(
-        observations, views, result, cameras=names, method=settings.method, truth=truth, solve=solve
-    )
+    method = settings.method if made.bodies is None else "auto"
+    metrics = assess(observations, views, result, cameras=names, method=method, truth=truth, solve=solve)
     people = _people_seen(description, names, seen.association, doubted)
     unseen = [description.names_of_people(k + 1)[k] for k in seen.association.unseen]
     metrics |= of_people(people["names"], observations, result, truth)
@@ -648,6 +647,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
             *seen.association.reasons,
             *(f"nobody is seen near the log of {name}" for name in unseen),
             *people_warnings(people),
+            *_unused_method(settings.method, made),
             *(
                 f"{name}: {counts['without_motion']} keypoints stand at the picture's time instead of their"
                 " row's: no neighbouring picture shows the person"
@@ -790,6 +790,13 @@ def _doubted(made: _Triangulated) -> list[str]:
     """Say of each person why they must not determine cameras and clocks; "" for those who do."""
     seen = made.seen
     return doubted_people(seen.observations, made.views, made.result, seen.association.doubts)
+
+
+def _unused_method(method: str, made: _Triangulated) -> list[str]:
+    """Say that a single camera is not triangulated, if somebody asked for that."""
+    if made.bodies is None or method == "auto":
+        return []
+    return [f"method {method} was not used: one camera measures no depth, so a body was fitted as by auto"]
 
 
 def _robust_flight(

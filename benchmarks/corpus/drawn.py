@@ -157,6 +157,11 @@ class DrawnFlight:
         if not self.flight.with_pictures:
             self._write_keypoint_files(place, detector)
         text = manifest_text(flight, video=self.flight.with_pictures, true_poses=poses != "logged")
+        if poses == "true" and given == "model":
+            exact = "\n    pose_noise: {white: {position_m: 0, rotation_deg: 0}}"
+            for drone in flight.drones:
+                pose = f"    pose: {{file: truth/{drone.name}.tum}}"
+                text = text.replace(pose, pose + exact)
         if poses == "shared":
             error = shared_error(flight)
             for drone in flight.drones:

@@ -262,6 +262,7 @@ def test_a_simulated_person_gets_her_body(tmp_path: Path) -> None:
     assert 0 < metrics["with_second_drone_mm"] < metrics["verdict"]["expected_error_mm"][2]
     assert abs(metrics["body"]["person0"]["stature_m"] - 1.62) < 0.05
     succeeds("report", alone)
+    assert succeeds("reconstruct", alone, "--method", "robust").startswith("auto: ")  # a body all the same
 
     succeeds("export", session, "--to", "mesh,bvh", "-o", tmp_path / "out")
     (path,) = (tmp_path / "out").glob("*.glb")
