@@ -164,7 +164,7 @@ def _numbers_of(line: str) -> list[float]:
 # --- TUM: eight numbers a line, separated by spaces, tabs or commas; # begins a comment line -----------
 
 _TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-# VINS-Mono and vio_loop.csv of VINS-Fusion have w first; vio.csv is TUM.
+# VINS-Mono and vio_loop of VINS-Fusion have w first; vio.csv is TUM.
 _VINS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 _HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name, perhaps with its unit
 
@@ -176,15 +176,18 @@ def _is_tum(head: str) -> bool:
     return find_poses(head) is None and (len(_numbers_of(first)) == len(_TUM) or _is_vins_mono(first))
 
 
-def _read_tum(path: Path) -> Trajectory:
-    """Read every pose in the order of columns that the header states, else in TUM's."""
-    text = read_text(path)
+def _layout(path: Path, text: str) -> tuple[str, tuple[str, ...], int, int]:
+    """Return the rows, the order, unit and number of their columns, by the header, else as TUM has them."""
     body, columns, unit = _take_header(_spaced(text))
-    first, width = body.partition("\n")[0], len(_TUM)
+    first = body.partition("\n")[0]
     if _is_vins_mono(first, text.partition("\n")[0]):
-        columns, unit, width = _VINS, NANOSECONDS, len(_numbers_of(first))
-    elif path.name == "vio_loop.csv" and columns == _TUM:
-        columns = _VINS
+        return body, _VINS, NANOSECONDS, len(_numbers_of(first))
+    return body, _VINS if path.stem == "vio_loop" and columns == _TUM else columns, unit, len(_TUM)
+
+
+def _read_tum(path: Path) -> Trajectory:
+    """Read every pose."""
+    body, columns, unit, width = _layout(path, read_text(path))
     numbers = {name: index for index, name in enumerate(columns) if index}
     table = parse_table(
         path, body, delimiter=" ", columns=width, text={"t": 0}, numbers=numbers, first_line=1
@@ -234,7 +237,15 @@ def _is_vins_mono(line: str, written: str = "") -> bool:
     return len(numbers) == length and numbers[0] > 1e17 and abs(math.hypot(*numbers[4:8]) - 1) < 1e-2
 
 
-TUM = TrajectoryFile("tum", "TUM trajectory", (".tum", ".txt", ".csv", ".log"), _is_tum, _read_tum)
+class _TumFile(TrajectoryFile):
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe the order of the quaternions, too; no content says that of one alone."""
+        order = _layout(path, read_text(path))[1][4:]
+        told = " ".join(order) + (" (else pose.quaternion: wxyz)" if order[-1] == "qw" else "")
+        return super().describe(path) | {"quaternion": told}
+
+
+TUM = _TumFile("tum", "TUM trajectory", (".tum", ".txt", ".csv", ".log"), _is_tum, _read_tum)
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

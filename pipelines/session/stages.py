@@ -218,15 +218,8 @@ def _libraries() -> dict[str, str]:
 
 _AT_ROOT = {
     "ingest": (
-        "cameras",
-        "actor.parquet",
-        "map",
-        "plan.parquet",
-        "truth.parquet",
-        "truth_poses.parquet",
-        "truth_body.parquet",
-        "truth_body_shape.parquet",
-        "session.json",
+        *("cameras", "actor.parquet", "map", "plan.parquet", "truth.parquet", "truth_poses.parquet"),
+        *("truth_body.parquet", "truth_body_shape.parquet", "session.json"),
     )
 }
 """Names that a stage publishes beside its own folder instead of inside it; only that stage writes them."""

@@ -140,6 +140,8 @@ class FlightCameras:
             raise DataError(path, problem, "check that they belong together", code="clock-unknown")
         lost = Counter(pictures.dropped) + Counter(stamps.dropped)
         lost["without a time"] += int((~known).sum())
+        if stamps.media_ns is None:  # a row for each coded picture has more than a decoder gives
+            lost["time without a picture"] += int(np.count_nonzero(stamps.frame >= len(known)))
         return pictures.some(known, t_ns[known], lost)
 
     def _start_ns(self, name: str, camera: CameraSources, times: FrameTimes) -> int:

@@ -41,7 +41,7 @@ from pipelines.geometry.clocks import ClockStep, find_steps, without_steps
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, LoggedMap, LogSource, Manifest, MapSource
 from pipelines.session.recognition import recognise
-from pipelines.session.records import IntrinsicsSample, Message, PictureSample, Trajectory
+from pipelines.session.records import IntrinsicsSample, Message, PictureSample, PoseSample, Trajectory
 from pipelines.session.registries import Log, LogFormat
 from pipelines.session.urls import located
 from pipelines.sources.world import in_enu, in_world, world_times
@@ -100,6 +100,8 @@ class FlightLog:
         """Return the topic that is named, or the only candidate; errors as in `choose`."""
         there = sorted(set(there))
         listed = ", ".join(there) or "none"
+        if topic is None and not there and noun == _NOUNS["pictures"]:
+            topic = next((t.name for t in self.recording.topics if t.type.endswith(_CODED_VIDEO)), None)
         if topic is not None:
             if topic in there:
                 return topic
@@ -226,7 +228,12 @@ class FlightLogs:
         with self.open(log) as opened:
             there = [known.name for known in opened.recording.topics if kind_of(known) == "poses"]
             name = topic or (there[0] if len(there) == 1 and parent is None else None)
-            if (axes := axes_of_topic(name, parent)) is not None:
+            axes = axes_of_topic(name, parent)
+            if axes is None and name and name.endswith("/odom_local_ned"):  # of a node of another name
+                places = all_samples(opened.recording.messages([name]), opened.source)
+                heights_m = [sample.position[2] for sample in places if isinstance(sample, PoseSample)]
+                axes = "ned" if heights_m and np.median(heights_m) < 0 else None
+            if axes is not None:
                 self._note(f"{opened.source}: {name or parent} is AirSim's, in {axes.upper()}")
             return axes
 

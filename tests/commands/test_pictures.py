@@ -59,13 +59,13 @@ def test_frames_are_stamped_by_the_container(tmp_path: Path) -> None:
 
 def test_frame_times_of_a_csv(tmp_path: Path) -> None:
     flight = with_videos(tmp_path)
-    rows = [f"{k},{START_NS + 40_000_000 * k}" for k in range(HALF_SECOND) if k != 3]
+    rows = [f"{k},{START_NS + 40_000_000 * k}" for k in range(HALF_SECOND + 2) if k != 3]
     (tmp_path / "times.csv").write_text("\n".join(["frame,t_ns", *rows]) + "\n", encoding="utf-8")
     flight.settings["cameras"]["drone1"]["frame_times"] = {"file": "times.csv"}
     flight.save()
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0, done.stderr
-    assert "drone1: frames dropped: 1 without a time" in done.stderr
+    assert "drone1: frames dropped: 1 without a time, 2 time without a picture" in done.stderr
     frames = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "drone1" / "frames.parquet")
     assert frames["frame"].tolist() == [0, 1, 2, *range(4, HALF_SECOND)]
     assert frames["t_ns"].iloc[3] == START_NS + 160_000_000

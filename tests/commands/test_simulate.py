@@ -115,11 +115,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(small: Path, tm
     lenses = {"drone1_camera.yaml", "drone2_camera.yaml"}
     assert same == {
         *lenses,
-        "flight.yaml",
-        "true_poses.yaml",
-        "site.npz",
-        "truth/clocks.json",
-        "truth/body_shape.parquet",
+        *("flight.yaml", "true_poses.yaml", "site.npz", "truth/clocks.json", "truth/body_shape.parquet"),
     }
 
 

@@ -27,15 +27,8 @@ from pipelines.geometry.arrays import Float
 @pytest.mark.parametrize(
     "name",
     [
-        "drone1",
-        "drone1_poses",
-        "Drone_01",
-        "drone-1.keypoints",
-        "/drone1/odometry",
-        "/drone1/camera/color/image_raw/compressed",
-        "rosbag2_drone1",
-        "drone1_halpe26_1080p_30fps",
-        "drone1_true",
+        *("drone1", "drone1_poses", "Drone_01", "drone-1.keypoints", "/drone1/odometry", "rosbag2_drone1"),
+        *("/drone1/camera/color/image_raw/compressed", "drone1_halpe26_1080p_30fps", "drone1_true"),
     ],
 )
 def test_names_of_the_same_drone_bear_one_label(name: str) -> None:

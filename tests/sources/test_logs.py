@@ -138,6 +138,19 @@ def test_messages_of_another_topic_in_the_gap_show_that_time_passed(tmp_path: Pa
     assert trajectory(write_log(tmp_path, "log", "mcap-cdr", still))[1] == []
 
 
+@pytest.mark.parametrize(("height_m", "axes"), [(-5.0, "ned"), (5.0, None)])
+def test_airsims_topic_of_another_node_is_known_by_its_heights(
+    tmp_path: Path, height_m: float, axes: str | None
+) -> None:
+    pose = {"pose": {"position": {"z": height_m}, "orientation": {"w": 1.0}}}
+    sent = [Entry("/sim/d1/odom_local_ned", TYPES["/pose"], t_ns, pose) for t_ns in TIMES_NS[:9].tolist()]
+    log = write_log(tmp_path, "log", "ros1", sent)
+    camera = {"pose": {"file": log.name}, "intrinsics": "x", "keypoints": "y"}
+    flight = Manifest.model_validate({"schema": 1, "cameras": {"c": camera}})
+    with FlightLogs(flight, tmp_path, lambda _: None) as logs:
+        assert logs.axes(log.name, None, None) == axes
+
+
 def read(folder: Path, focal_px: list[float], binning: int = 0) -> tuple[Intrinsics, list[str]]:
     """Write a log of 640 x 480 px with these focal lengths, one a message; 0 is not calibrated."""
     entries = []

@@ -42,21 +42,13 @@ from pipelines.session.storage import damaged
 _3D_FIX = 3
 _GPS = ("vehicle_gps_position", "sensor_gps")
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64  # GIMBAL_DEVICE_FLAGS of MAVLink
-_WANTED = {
-    *_GPS,
-    "vehicle_local_position",
-    "estimator_local_position",
-    "vehicle_global_position",
-    "estimator_global_position",
-    "vehicle_attitude",
-    "estimator_attitude",
-    "gimbal_device_attitude_status",
-}
 _POSITIONS = {
     "local": ("vehicle_local_position", "estimator_local_position"),
     "global": ("vehicle_global_position", "estimator_global_position"),
     "gps": _GPS,
 }
+_ATTITUDES = {"vehicle_attitude", "estimator_attitude", "gimbal_device_attitude_status"}
+_WANTED = _ATTITUDES.union(*_POSITIONS.values())
 MAGIC = b"ULog\x01\x12\x35"
 # PX4's largest message has some hundreds of fields, with its nested types.
 _MOST_FIELDS = 20_000

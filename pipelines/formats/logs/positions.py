@@ -17,11 +17,8 @@ from pipelines.session.records import PositionTrack, Telemetry, Topic
 from pipelines.session.registries import Log
 
 FIXES = (
-    "sensor_msgs/msg/NavSatFix",
-    "gps_common/msg/GPSFix",
-    "gps_msgs/msg/GPSFix",
-    "foxglove.LocationFix",
-    "foxglove_msgs/msg/LocationFix",
+    *("sensor_msgs/msg/NavSatFix", "gps_common/msg/GPSFix", "gps_msgs/msg/GPSFix"),
+    *("foxglove.LocationFix", "foxglove_msgs/msg/LocationFix"),
 )
 """Types of positions on Earth."""
 

@@ -178,12 +178,7 @@ def lens(value: Any, type_name: str = "sensor_msgs/msg/CameraInfo") -> Intrinsic
 )
 def test_camera_info(version: str, stated: Any, model: str, distortion: tuple[float, ...]) -> None:
     assert lens(camera_info(version, **stated)) == Intrinsics(
-        640,
-        480,
-        800,
-        800,
-        320,
-        240,
+        *(640, 480, 800, 800, 320, 240),
         model,  # type: ignore[arg-type]  # one of the literals
         distortion,
     )

@@ -148,16 +148,18 @@ def test_vins_writes_w_first(tmp_path: Path) -> None:
     """VINS-Fusion's vio_loop.csv by its name, VINS-Mono's rows by their nanoseconds and last comma."""
     turned = [0.5, 0.1, 0.7, 0.5]  # w x y z
     numbers = " ".join(map(str, [1.5, -2.0, 3.0, *turned]))
-    (tmp_path / "vio_loop.csv").write_text(f"1700000000.25 {numbers}\n1700000001.25 {numbers}\n")
+    for suffix in (".csv", ".txt"):
+        (tmp_path / f"vio_loop{suffix}").write_text(f"1700000000.25 {numbers}\n1700000001.25 {numbers}\n")
     mono = f"1700000000250000000,{numbers.replace(' ', ',')},0.1,0.2,0.3,\n"
     both = mono + mono.replace("000250", "001250")
     (tmp_path / "vins.csv").write_text(both)
     (tmp_path / "vins_result_loop.csv").write_text(both.replace("0.1,0.2,0.3,", ""))
-    for name in ("vio_loop.csv", "vins.csv", "vins_result_loop.csv"):
+    for name in ("vio_loop.csv", "vio_loop.txt", "vins.csv", "vins_result_loop.csv"):
         assert READER.recognises(tmp_path / name)
         found = READER.read_trajectory(tmp_path / name)
         assert found.t_ns.tolist() == [1_700_000_000_250_000_000, 1_700_000_001_250_000_000]
         np.testing.assert_allclose(found.position[0], [1.5, -2.0, 3.0])
         np.testing.assert_allclose(found.quaternion_xyzw[0], np.array([0.1, 0.7, 0.5, 0.5]))
+        assert READER.describe(tmp_path / name)["quaternion"] == "qw qx qy qz"
     (tmp_path / "vio.csv").write_text(f"1700000000.25 {numbers}\n")
     np.testing.assert_allclose(READER.read_trajectory(tmp_path / "vio.csv").quaternion_xyzw[0], turned)
