@@ -776,11 +776,15 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
         # Named format and protocol, because a playlist under this name must not make FFmpeg open other files.
         container = av.open(f"file:{path.absolute()}", format=kind, metadata_errors="replace")
     except FFmpegError as error:
-        raise _unreadable(path, kind, "cannot be opened as a video") from error
+        if kind != "mov":
+            raise _unreadable(path, "cannot be opened as a video") from error
+        problem = "has no readable table of its frames (moov): the recording was not closed, or it is cut off"
+        remedy = "copy it again, or repair it with a whole recording of the same camera"
+        raise DataError(path, problem, remedy, code="damaged") from error
     streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
     if not streams:
         container.close()
-        raise _unreadable(path, kind, "holds no video stream")
+        raise _unreadable(path, "holds no video stream")
     # None for an unknown codec, despite its annotation.
     known = [s for s in streams if s.codec_context is not None]  # type: ignore[redundant-expr]
     if not known:
@@ -800,14 +804,7 @@ def _undecodable(path: Path, count: int) -> DataError:
     return DataError(path, f"none of its {count} frames can be decoded", "export it again, as MP4")
 
 
-def _unreadable(path: Path, kind: str, problem: str) -> DataError:
-    if kind == "mov" and not _has_table(path):
-        return DataError(
-            path,
-            "has no table of its frames (moov): the recording was not closed, or the file is cut off",
-            "copy it again, or repair it with a whole recording of the same camera",
-            code="damaged",
-        )
+def _unreadable(path: Path, problem: str) -> DataError:
     return DataError(path, problem, "check that it is a video, and copy it again")
 
 
@@ -846,25 +843,6 @@ def container_format(path: Path) -> str | None:
             if suffix in suffixes or (beginning is not None and beginning.match(head)):
                 return kind
     return None
-
-
-def _has_table(path: Path) -> bool:
-    """Return True if an MP4 has its complete `moov` box."""
-    size = path.stat().st_size
-    start = 0
-    with path.open("rb") as file:
-        while start + 8 <= size:
-            file.seek(start)
-            head = file.read(16)
-            length = int.from_bytes(head[:4], "big")
-            if length == 1:
-                length = int.from_bytes(head[8:], "big")
-            if head[4:8] == b"moov":
-                return length >= 8 and start + length <= size
-            if length < 8:
-                return False
-            start += length
-    return False
 
 
 def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
