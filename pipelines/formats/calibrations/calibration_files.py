@@ -58,6 +58,38 @@ def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> Float:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
+def _camera_of(
+    path: Path,
+    name: str,
+    size: Sequence[float],
+    matrix: Float,
+    distortion: Sequence[float],
+    *,
+    fisheye: bool = False,
+) -> CalibratedCamera:
+    """Build a camera; a size of zeros is not stated, and the pictures decide."""
+    stated = any(size)
+    lens = intrinsics(
+        path,
+        name,
+        size=size if stated else unstated_size(matrix),
+        matrix=matrix,
+        distortion=distortion,
+        fisheye=fisheye,
+    )
+    return CalibratedCamera(lens, size_stated=stated)
+
+
+def _placed(
+    path: Path, name: str, camera: CalibratedCamera, rotation: Float, translation: Float
+) -> CalibratedCamera:
+    """Add a pose camera_from_world: a rotation vector, or a matrix, and a translation."""
+    invert = invert_rodrigues if rotation.size == 3 else invert_matrix
+    rotation = rotation.ravel() if rotation.size == 3 else rotation
+    position, quaternion_xyzw = invert(path, name, rotation, translation.ravel())
+    return replace(camera, position=position, quaternion_xyzw=quaternion_xyzw)
+
+
 # --- ROS: camera_info as YAML or INI (camera_calibration_parsers), for the raw picture -----------------
 
 # Drivers write an empty model if they were never calibrated, or if the lens has no distortion.
@@ -91,15 +123,8 @@ def _read_camera_info(path: Path) -> Cameras:
     if model not in _FISHEYE | _RADTAN:
         problem = f"camera {name} has the distortion model {model[:40]!r}"
         raise DataError(path, problem, "calibrate it as plumb_bob, rational_polynomial or equidistant")
-    lens = intrinsics(
-        path,
-        name,
-        size=size,
-        matrix=matrix,
-        distortion=distortion.ravel().tolist(),
-        fisheye=model in _FISHEYE,
-    )
-    return {name: CalibratedCamera(lens)}
+    fisheye = model in _FISHEYE
+    return {name: _camera_of(path, name, size, matrix, distortion.ravel().tolist(), fisheye=fisheye)}
 
 
 def _ros_matrix(path: Path, name: str, value: object) -> Float:
@@ -229,28 +254,6 @@ class Storage:
             raise damaged(self._path, f"{key} is not a matrix of numbers") from error
 
 
-def _stored_camera(
-    path: Path,
-    name: str,
-    size: Sequence[float],
-    matrix: Float,
-    distortion: Sequence[float],
-    *,
-    fisheye: bool = False,
-) -> CalibratedCamera:
-    """Build a camera; a size of zeros is not stated, and the pictures decide."""
-    stated = any(size)
-    lens = intrinsics(
-        path,
-        name,
-        size=size if stated else unstated_size(matrix),
-        matrix=matrix,
-        distortion=distortion,
-        fisheye=fisheye,
-    )
-    return CalibratedCamera(lens, size_stated=stated)
-
-
 def _with_pose(
     path: Path, name: str, storage: Storage, camera: CalibratedCamera, *keys: tuple[str, ...]
 ) -> CalibratedCamera:
@@ -261,11 +264,7 @@ def _with_pose(
     if rotation is None or translation is None:
         problem = "has a rotation or a translation, but not both"
         raise DataError(path, problem, "give R and T, or rvec and tvec")
-    if rotation.size == 3:
-        pose = invert_rodrigues(path, name, rotation.ravel(), translation.ravel())
-    else:
-        pose = invert_matrix(path, name, rotation, translation.ravel())
-    return replace(camera, position=pose[0], quaternion_xyzw=pose[1])
+    return _placed(path, name, camera, rotation, translation)
 
 
 # OpenCV's own samples spell their keys in more than one way.
@@ -288,7 +287,7 @@ def _read_opencv(path: Path) -> Cameras:
     if matrix is None or distortion is None:
         raise damaged(path, "has no camera_matrix or no distortion_coefficients")
     fisheye = bool(storage.number("fisheye_model")) or storage.text("distortion_model").lower() in _FISHEYE
-    camera = _stored_camera(path, name, size, matrix, distortion.ravel().tolist(), fisheye=fisheye)
+    camera = _camera_of(path, name, size, matrix, distortion.ravel().tolist(), fisheye=fisheye)
     return {name: _with_pose(path, name, storage, camera, ("R", "rvec"), ("T", "tvec"))}
 
 
@@ -316,7 +315,7 @@ def _read_easymocap(path: Path) -> Cameras:
         if matrix is None or distortion is None:
             raise damaged(ways[0], f"has no K_{name} or no dist_{name}")
         size = [lenses.number(f"{side}_{name}") for side in "WH"]
-        camera = _stored_camera(ways[0], name, size, matrix, distortion.ravel().tolist())
+        camera = _camera_of(ways[0], name, size, matrix, distortion.ravel().tolist())
         keys = (f"Rot_{name}", f"R_{name}"), (f"T_{name}",)
         found[name] = _with_pose(ways[1], name, places, camera, *keys) if places else camera
     if not found:
@@ -344,7 +343,7 @@ def _read_orbslam(path: Path) -> Cameras:
     fisheye = _PROJECTIONS[projection.lower()]
     distortion = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     return {
-        name: _stored_camera(
+        name: _camera_of(
             path,
             name,
             [storage.number(f"{name}.{side}", f"Camera.{side}") for side in ("width", "height")],
@@ -389,18 +388,18 @@ def _read_camodocal(path: Path) -> Cameras:
     matrix = _matrix_of(*(storage.number(f"projection_parameters/{key}") for key in names[model].split()))
     if model == "KANNALA_BRANDT":
         coefficients = [storage.number(f"projection_parameters/k{k}") for k in range(2, 6)]
-        return {name: _stored_camera(path, name, size, matrix, coefficients, fisheye=True)}
+        return {name: _camera_of(path, name, size, matrix, coefficients, fisheye=True)}
     keys = ("k1", "k2", "p1", "p2", *(("k3", "k4", "k5", "k6") if model == "PINHOLE_FULL" else ()))
     radtan = [storage.number(f"distortion_parameters/{key}") for key in keys]
     xi = storage.number("mirror_parameters/xi")
     if model.startswith("PINHOLE") or not xi or not np.diag(matrix).all():
-        return {name: _stored_camera(path, name, size, matrix, radtan)}
+        return {name: _camera_of(path, name, size, matrix, radtan)}
     focal, coefficients, off_px = _fisheye_like(size, matrix, radtan, xi) if xi > 0 else (1.0, [], np.inf)
     if not off_px <= MAX_APPROXIMATION_PX:
         problem = f"is a lens (MEI, xi {xi:g}) that no fisheye of ours fits: it is off by {off_px:.1f} px"
         raise DataError(path, problem, "calibrate it as KANNALA_BRANDT", code="unsupported")
     matrix[:2, :2] *= focal
-    camera = _stored_camera(path, name, size, matrix, coefficients, fisheye=True)
+    camera = _camera_of(path, name, size, matrix, coefficients, fisheye=True)
     note = f"its MEI model is approximated by a fisheye, off by at most {off_px:.2f} px"
     return {name: replace(camera, note=note)}
 
@@ -484,20 +483,14 @@ def _tables(path: Path) -> dict[str, dict[str, object]]:
 
 
 def _camera_of_table(path: Path, name: str, table: dict[str, object]) -> CalibratedCamera:
-    lens = intrinsics(
-        path,
-        name,
-        size=_finite(path, name, table, "size").ravel().tolist(),
-        matrix=_finite(path, name, table, "matrix"),
-        distortion=_finite(path, name, table, "distortions").ravel().tolist(),
-        fisheye=bool(table.get("fisheye", False)),
-    )
+    size, matrix, distortion = (_finite(path, name, table, key) for key in ("size", "matrix", "distortions"))
+    numbers_of = size.ravel().tolist(), matrix, distortion.ravel().tolist()
+    camera = _camera_of(path, name, *numbers_of, fisheye=bool(table.get("fisheye", False)))
     if not {"rotation", "translation"} & table.keys():
-        return CalibratedCamera(lens)
-    rotation, translation = (_finite(path, name, table, key) for key in ("rotation", "translation"))
-    if rotation.shape == (3, 3):
-        return CalibratedCamera(lens, *invert_matrix(path, name, rotation, translation.ravel()))
-    return CalibratedCamera(lens, *invert_rodrigues(path, name, rotation.ravel(), translation.ravel()))
+        return camera
+    return _placed(
+        path, name, camera, *(_finite(path, name, table, key) for key in ("rotation", "translation"))
+    )
 
 
 def _finite(path: Path, camera: str, table: dict[str, object], key: str) -> Float:
@@ -553,19 +546,14 @@ def _kalibr_camera(path: Path, name: str, block: object) -> CalibratedCamera:
             f" instead of 4 and {_DISTORTIONS[distortion]} (pinhole, {distortion})"
         )
         raise damaged(path, problem)
-    lens = intrinsics(
-        path,
-        name,
-        size=numbers(path, f"{name}.resolution", keys["resolution"]).tolist(),
-        matrix=_matrix_of(*focal),
-        distortion=coefficients.tolist(),
-        fisheye=distortion == "equidistant",
-    )
+    size = numbers(path, f"{name}.resolution", keys["resolution"]).tolist()
+    fisheye = distortion == "equidistant"
+    camera = _camera_of(path, name, size, _matrix_of(*focal), coefficients.tolist(), fisheye=fisheye)
     if "timeshift_cam_imu" not in keys:
-        return CalibratedCamera(lens)
+        return camera
     (shift_s,) = numbers(path, f"{name}.timeshift_cam_imu", [keys["timeshift_cam_imu"]])
     note = f"timeshift_cam_imu of {shift_s:g} s is not used; of poses by that IMU, set `clock.offset_s` to it"
-    return CalibratedCamera(lens, note=note)
+    return replace(camera, note=note)
 
 
 KALIBR = CalibrationFile(
@@ -629,7 +617,7 @@ def _airsim_camera(
         raise bad_value(path, problem)
     focal_px = width / 2 / np.tan(np.radians(fov_deg) / 2)
     matrix = _matrix_of(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
-    lens = intrinsics(path, name, size=[width, height], matrix=matrix, distortion=[], fisheye=False)
+    camera = _camera_of(path, name, [width, height], matrix, [])
     keys = ("X", "Y", "Z", "Pitch", "Roll", "Yaw")
     placed = [0.0 if block.get(key) is None else block[key] for key in keys]
     x, y, z, pitch, roll, yaw = numbers(path, name, placed).tolist()
@@ -640,7 +628,7 @@ def _airsim_camera(
             f"sits on its vehicle as mount: {{looks: forward, down_deg: {0 - pitch:g}, translation: {arm}}}"
         )
         note += f", turned by yaw {yaw:g} and roll {roll:g} deg" if yaw or roll else ""
-    return CalibratedCamera(lens, note=note)
+    return replace(camera, note=note)
 
 
 AIRSIM = CalibrationFile("airsim_settings", "AirSim settings", (".json",), _is_airsim, _read_airsim)
