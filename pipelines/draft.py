@@ -57,7 +57,7 @@ from pipelines.formats.videos.video import VideoReader, created_ns
 from pipelines.geometry.arrays import Float, Int64, Intrinsics, Place, RelativeTo
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.mounting import body_from_camera, level_heading
-from pipelines.geometry.poses import interpolate_points, interpolate_poses, multiply
+from pipelines.geometry.poses import interpolate_points, interpolate_rotations, multiply
 from pipelines.reconstruction.background_tracks import Follower
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
@@ -630,10 +630,7 @@ def _turned_by(gimbal: Proposal, t_ns: Int64, body: Float) -> Iterator[tuple[Rel
         with recognise(gimbal.path, LogFormat, "log").open_log([gimbal.path]) as log:
             logged = all_samples(log.messages([gimbal.topic]), gimbal.path)
             found = attitudes_of(logged, gimbal.path, stamps="header").trajectory
-        nowhere = np.zeros((len(found.t_ns), 3))
-        attitude = interpolate_poses(
-            found.t_ns, nowhere, found.quaternion_xyzw, t_ns, max_gap_ns=MAX_GAP_NS, max_extrapolation_ns=0
-        )[1]
+        attitude = interpolate_rotations(found.t_ns, found.quaternion_xyzw, t_ns, max_gap_ns=MAX_GAP_NS)
         yield "world", attitude
         yield "body", multiply(body, attitude)
         yield "heading", multiply(level_heading(body), attitude)

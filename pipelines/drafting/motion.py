@@ -103,9 +103,7 @@ def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int)
     from scipy.ndimage import gaussian_filter1d
 
     at_ns = t_ns[0] + np.arange(0, int(t_ns[-1] - t_ns[0]) + 1, round(STEP_S * 1e9))
-    moved, turned = interpolate_poses(
-        t_ns, position, quaternion_xyzw, at_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=0
-    )
+    moved, turned = interpolate_poses(t_ns, position, quaternion_xyzw, at_ns, max_gap_ns=max_gap_ns)
     there: Bool = np.asarray(np.isfinite(moved).all(axis=1))
     width = SMOOTHING_SIGMA_S / STEP_S
     weight = gaussian_filter1d(there.astype(np.float64), width, mode="constant")

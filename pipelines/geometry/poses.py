@@ -141,7 +141,7 @@ def interpolate_poses(
     at_ns: Int64,
     *,
     max_gap_ns: int,
-    max_extrapolation_ns: int,
+    max_extrapolation_ns: int = 0,
 ) -> tuple[Float, Float]:
     """Interpolate poses between strictly increasing stamps [N]: linear in position, slerp in rotation.
 
@@ -153,12 +153,18 @@ def interpolate_poses(
     between = _bracket(t_ns, at_ns, max_gap_ns, max_extrapolation_ns)
     if not len(t_ns):
         return np.full((len(at_ns), 3), np.nan), np.full((len(at_ns), 4), np.nan)
-    continuous = continuous_signs(quaternion_xyzw)
     fraction = between.fraction[:, None]
     positions = position[between.before] + fraction * (position[between.after] - position[between.before])
-    quaternions = _slerp(continuous[between.before], continuous[between.after], fraction)
-    unknown = ~between.known[:, None]
-    return np.where(unknown, np.nan, positions), np.where(unknown, np.nan, quaternions)
+    positions = np.where(between.known[:, None], positions, np.nan)
+    return positions, _turned_between(quaternion_xyzw, between)
+
+
+def interpolate_rotations(
+    t_ns: Int64, quaternion_xyzw: Float, at_ns: Int64, *, max_gap_ns: int, max_extrapolation_ns: int = 0
+) -> Float:
+    """Interpolate rotations [M, 4] between strictly increasing stamps [N], as `interpolate_poses` does."""
+    between = _bracket(t_ns, at_ns, max_gap_ns, max_extrapolation_ns)
+    return _turned_between(quaternion_xyzw, between) if len(t_ns) else np.full((len(at_ns), 4), np.nan)
 
 
 def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: int) -> Float:
@@ -236,6 +242,12 @@ def continuous_signs(quaternion_xyzw: Float) -> Float:
     same_side = np.sum(quaternion_xyzw[1:] * quaternion_xyzw[:-1], axis=-1) >= 0
     flips = np.concatenate([[1.0], np.where(same_side, 1.0, -1.0)])
     return quaternion_xyzw * np.cumprod(flips)[:, None]
+
+
+def _turned_between(quaternion_xyzw: Float, between: _Bracket) -> Float:
+    continuous = continuous_signs(quaternion_xyzw)
+    turned = _slerp(continuous[between.before], continuous[between.after], between.fraction[:, None])
+    return np.where(between.known[:, None], turned, np.nan)
 
 
 def _slerp(start: Float, end: Float, fraction: Float) -> Float:

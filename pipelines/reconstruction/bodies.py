@@ -301,7 +301,6 @@ def _surface_errors(t_ns: Int64, body: BodyFit, truth: MovingBody) -> dict[str, 
             truth.rotation[:, bone],
             t_ns[body.row[chosen]],
             max_gap_ns=_LONGEST_STEP_NS,
-            max_extrapolation_ns=0,
         )
         for bone in range(len(BONES))
     ]

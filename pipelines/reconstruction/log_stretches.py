@@ -111,7 +111,6 @@ def _bridged(log: Trajectory, before: int, after: int, kind: int) -> Trajectory:
         log.quaternion_xyzw[ends],
         log.t_ns[inside],
         max_gap_ns=int(log.t_ns[after] - log.t_ns[before]),
-        max_extrapolation_ns=0,
     )
     if kind == 0:
         own = log.position.copy()

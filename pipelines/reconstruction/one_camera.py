@@ -204,14 +204,7 @@ def _at_every_time(
     """Interpolate poses and covariances from moments to the times between them."""
     quaternion = quaternion_from_matrix(poses.turn)
     parts = [
-        interpolate_poses(
-            t_ns[row],
-            poses.root,
-            quaternion[:, bone],
-            t_ns,
-            max_gap_ns=_LONGEST_GAP_NS,
-            max_extrapolation_ns=0,
-        )
+        interpolate_poses(t_ns[row], poses.root, quaternion[:, bone], t_ns, max_gap_ns=_LONGEST_GAP_NS)
         for bone in range(len(BONES))
     ]
     (known,) = np.nonzero(np.isfinite(parts[0][0]).all(axis=-1))

@@ -24,7 +24,7 @@ from pipelines.geometry.poses import (
     compose,
     conjugate,
     interpolate_points,
-    interpolate_poses,
+    interpolate_rotations,
     invert,
     look_at,
     mounted_covariance,
@@ -393,14 +393,7 @@ def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
     position = _hermite(grid_ns, paths.position[drone], paths.velocity[drone], t_ns)
     longest_ns = int(np.diff(grid_ns).max(initial=0))
     body_xyzw, camera_xyzw = (
-        interpolate_poses(
-            grid_ns,
-            paths.position[drone],
-            quaternion[drone],
-            t_ns,
-            max_gap_ns=longest_ns,
-            max_extrapolation_ns=0,
-        )[1]
+        interpolate_rotations(grid_ns, quaternion[drone], t_ns, max_gap_ns=longest_ns)
         for quaternion in (paths.body_xyzw, paths.camera_xyzw)
     )
     camera_position = position + rotate(body_xyzw, np.array(LEVER_ARM))

@@ -22,7 +22,7 @@ from pipelines.geometry.mounting import attitude_in_enu, compose_gimbal, level_h
 from pipelines.geometry.poses import (
     compose,
     interpolate_points,
-    interpolate_poses,
+    interpolate_rotations,
     mounted_covariance,
     multiply,
     quaternion_from_matrix,
@@ -370,14 +370,7 @@ class FlightPoses:
         """Interpolate attitudes [N, 4] at given times, NaN outside the track; fixed angles always hold."""
         if track.name == _FIXED:
             return np.repeat(track.quaternion_xyzw, len(t_ns), axis=0)
-        return interpolate_poses(
-            track.t_ns,
-            np.zeros((len(track.t_ns), 3)),
-            track.quaternion_xyzw,
-            t_ns,
-            max_gap_ns=self._max_gap_ns,
-            max_extrapolation_ns=0,
-        )[1]
+        return interpolate_rotations(track.t_ns, track.quaternion_xyzw, t_ns, max_gap_ns=self._max_gap_ns)
 
     def _axes(self, *stated: Axes | None) -> Axes:
         return next((axes for axes in stated if axes), self._flight.world.frame)

@@ -13,7 +13,7 @@ from pipelines.formats.common.rows import NORM_TOLERANCE, describe_times, kept_r
 from pipelines.geometry.arrays import Bool, ClockFit, Float, Int64, Place, RelativeTo
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_from_angles, attitude_in_enu, level_heading
-from pipelines.geometry.poses import interpolate_points, interpolate_poses, multiply
+from pipelines.geometry.poses import interpolate_points, interpolate_rotations, multiply
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, Height, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice
@@ -177,14 +177,8 @@ def pictures_on_gps_time(source: Path, t_ns: Int64, fit: ClockFit | None, choice
 
 def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:
     """Return attitudes [N, 4] of an FLU gimbal in ENU, from an FRD one with yaw relative to the nose."""
-    _, turned = interpolate_poses(
-        body.t_ns,
-        np.zeros((len(body.t_ns), 3)),
-        body.quaternion_xyzw,
-        t_ns,
-        max_gap_ns=_HELD_NS,
-        max_extrapolation_ns=_HELD_NS // 10,
-    )
+    limits = {"max_gap_ns": _HELD_NS, "max_extrapolation_ns": _HELD_NS // 10}
+    turned = interpolate_rotations(body.t_ns, body.quaternion_xyzw, t_ns, **limits)
     in_heading = attitude_in_enu(heading_from_gimbal, relative_to="heading", axes="ned")
     return multiply(level_heading(turned), in_heading)
 

@@ -149,7 +149,6 @@ def _place_at(t_ns: int, about: MapTopic) -> Pose | None:
         poses.quaternion_xyzw[around],
         np.array([t_ns], np.int64),
         max_gap_ns=about.max_gap_ns,
-        max_extrapolation_ns=0,
     )
     return None if np.isnan(position[0, 0]) else (position[0], quaternion[0])
 

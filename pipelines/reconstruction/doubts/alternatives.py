@@ -16,7 +16,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import level_heading
 from pipelines.geometry.poses import (
-    interpolate_poses,
+    interpolate_rotations,
     matrix_from_quaternion,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
@@ -466,10 +466,8 @@ def _body(trial: Trial, index: int) -> Float | None:
     if track.body_xyzw is None:
         return None
     gap_ns = trial.flight.between.max_gap_ns
-    xyzw = interpolate_poses(
-        track.t_ns, track.position, track.body_xyzw, t_ns, max_gap_ns=gap_ns, max_extrapolation_ns=gap_ns
-    )[1]
-    return matrix_from_quaternion(xyzw)
+    limits = {"max_gap_ns": gap_ns, "max_extrapolation_ns": gap_ns}
+    return matrix_from_quaternion(interpolate_rotations(track.t_ns, track.body_xyzw, t_ns, **limits))
 
 
 def _frames(body: Float) -> dict[str, Float]:

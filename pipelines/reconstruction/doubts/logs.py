@@ -173,8 +173,7 @@ def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt |
 def _poses_at(track: Trajectory, t_ns: Int64) -> tuple[Float, Float]:
     """Interpolate positions [N, 3] and rotations [N, 4], also across gaps of the log."""
     gap_ns = int(track.t_ns[-1] - track.t_ns[0]) + 1
-    poses = (track.t_ns, track.position, track.quaternion_xyzw, t_ns)
-    return interpolate_poses(*poses, max_gap_ns=gap_ns, max_extrapolation_ns=0)
+    return interpolate_poses(track.t_ns, track.position, track.quaternion_xyzw, t_ns, max_gap_ns=gap_ns)
 
 
 def _topic(pair: Mapping[str, CameraEntry]) -> str:
