@@ -56,8 +56,8 @@ TUNED, KEPT = "tuned on", "kept aside"
 SECTIONS = (
     Section(
         "Skeletons",
-        "Errors are those of joints, in mm. True poses show what the detector alone costs. The error that all"
-        " cameras share cannot be seen in pictures: it bounds what any method reaches. NEES of 3 is right.",
+        "Errors are those of joints, in mm. The error that all cameras share bounds what any method reaches."
+        " NEES of 3 is right.",
         (
             Part("sample-poses", "The sample flight", RENDERED, TUNED),
             Part("corpus-model", "The corpus, pose noise stated", RENDERED, KEPT),
@@ -180,9 +180,9 @@ def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
         *_words(
             "All figures of this project, each table with kind, command (or that above), date and commit."
             " `python -m benchmarks.results` measures the sample again and writes this page; the other"
-            " commands replace their tables with `--write`. Constants were tuned on flights that are"
-            " called so; no constant was chosen because of those kept aside. Closed loops of planners"
-            " amplify rounding: other processors change their figures by up to 8 %."
+            " commands replace their tables with `--write`. No constant was chosen because of flights kept"
+            " aside. Closed loops of planners amplify rounding: other processors change their figures by up"
+            " to 8 %."
         ),
     ]
     before = ""  # the command of the table above, which is not repeated
