@@ -1,24 +1,27 @@
 """Stage `film`: rendered films of a comparison's arms, with a real detector on the pictures.
 
 The scenario's world is built again, and what every camera would have seen is rendered, detected,
-reconstructed in several draws of the poses' noise and measured against the truth, which also says whom a
-detection shows. Where the films and the modelled measurement disagree, the films decide. `replan` is only
-read.
+reconstructed as `auto` does it in several draws of the poses' noise, and measured against the truth, which
+also says whom a detection shows. Where the films and the modelled measurement disagree, the films decide.
+`replan` is only read.
 """
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from pipelines.detect import TIME_BETWEEN_STILLS_S
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Bool, Float, Int64, Picture
-from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.noise import NoiseModel, pose_errors
+from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.comparison import common_frames, figures_of, filmed_verdict, judge, verdict
@@ -27,13 +30,24 @@ from pipelines.planning.distance_field import DistanceField, distance_field, in_
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.replay import CameraPaths, MeasuredJoints, joined, known_from, measure, poses_from
 from pipelines.planning.scene import LoggedFlight, load_flight
+from pipelines.reconstruction.background import refine_cameras
+from pipelines.reconstruction.background_tracks import (
+    Followed,
+    Follower,
+    Stills,
+    Tracks,
+    off_people,
+    people_boxes,
+)
+from pipelines.reconstruction.ground import bind_positions
+from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.refining import refined_points
-from pipelines.session.description import Description, read_description
+from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.people import LoggedActor, logged_people
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import JointMotion
+from pipelines.session.records import Detections, JointMotion, Trajectory
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import SIMULATION_MARK, hash_of, jsonable, read_json, sha256_of, write_json
@@ -50,7 +64,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=13)
+FILM = Stage("film", revision=14)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -175,8 +189,10 @@ def film(
             ]
             sightings = _read_sightings(parts)
             seed = compared.settings["seed"]  # one draw of the comparison's pose noise
+            cameras = [_corrected(arm, sightings, parts, seed=seed, draw=draw) for draw in range(DRAWS)]
             measured = [
-                _measured(arm, of, seen, seed=seed) for of, seen in zip(arm.people, sightings, strict=True)
+                _measured(arm, of, seen, cameras, seed=seed)
+                for of, seen in zip(arm.people, sightings, strict=True)
             ]
             points = np.stack([own for own, _, _ in measured], axis=1)
             errors[name] = joined([of_draws for _, of_draws, _ in measured])
@@ -314,19 +330,27 @@ def _rows(t_ns: Int64, settings: FilmSettings) -> Int64:
 def _film_camera(
     arm: _Arm, camera: int, renderer: Renderer, detector: Detector, progress: Progress, folder: Path
 ) -> None:
-    """Write one camera's pictures and the detector's keypoints: xy [T, P, J, 2], confidence [T, P, J]."""
+    """Write one camera's pictures, the points of the background in them, some of them in grey, and keypoints.
+
+    These are xy [T, P, J, 2] px and confidence [T, P, J].
+    """
     lens = arm.seen_by.lens
     alone = len(arm.people) == 1
     follower = FollowedPeople(detector.load(threads=1), arm.people[0].person.joints, only_one=alone)
     found: list[tuple[Float, Float]] = []
     joints = len(arm.people[0].person.joints)
     nobody = np.empty((0, joints, 2)), np.empty((0, joints))
+    background, stills = Follower(), _stills(arm.t_ns)
+    greys: list[Picture] = []
 
     def pictures() -> Iterator[Picture]:
         for k in range(len(arm.t_ns)):
             pose = arm.seen_by.position[camera, k], arm.seen_by.quaternion_xyzw[camera, k]
             bodies = [of.person.surface(of.motion.root[k], of.motion.rotation[k]) for of in arm.people]
             picture = renderer.picture(*pose, bodies, k)
+            grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+            background.step(k, grey)
+            greys.extend([grey] if k in stills else [])
             hints = [
                 project_actor(hips[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD)
                 for hips in arm.logged
@@ -341,6 +365,13 @@ def _film_camera(
     )
     xy, confidence = (np.stack(part) for part in zip(*found, strict=True))
     np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
+    np.savez_compressed(folder / "background.npz", **asdict(background.tracks()), greys=np.stack(greys))
+
+
+def _stills(t_ns: Int64) -> Int64:
+    """Choose the pictures, of times [T], in which the ground is compared."""
+    count = round((t_ns[-1] - t_ns[0]) / 1e9 / TIME_BETWEEN_STILLS_S) + 1
+    return np.unique(np.linspace(0, len(t_ns) - 1, min(count, len(t_ns))).round().astype(np.int64))
 
 
 def _whose(
@@ -375,15 +406,73 @@ def _read_sightings(parts: Sequence[Path]) -> list[SimulatedKeypoints]:
     return [SimulatedKeypoints(found[:, :, p], sure[:, :, p]) for p in range(found.shape[2])]
 
 
+def _corrected(
+    arm: _Arm, sightings: Sequence[SimulatedKeypoints], parts: Sequence[Path], *, seed: int, draw: int
+) -> list[Camera]:
+    """Disturb an arm's poses, and correct them by backgrounds and ground, as `auto` does."""
+    t_ns, joints, rows = arm.t_ns, tuple(arm.people[0].person.joints), np.arange(len(arm.t_ns))
+    logged = views_of(arm.people[0], arm.seen_by, sightings[0], arm.noise, seed=seed, trial=draw)
+    cameras: list[Camera] = []
+    followed: dict[str, Followed | str] = {}
+    stills: dict[str, Stills] = {}
+    for k, (name, part) in enumerate(zip(arm.names, parts, strict=True)):
+        xy, confidence = (
+            np.stack([getattr(own, field)[k] for own in sightings], axis=1) for field in ("xy", "confidence")
+        )
+        frame, person = np.nonzero(np.isfinite(xy[..., 0]).any(axis=2))
+        found = Detections(joints, frame, person, xy[frame, person], confidence[frame, person], rows)
+        attitude = quaternion_from_matrix(logged.rotation[:, k])
+        camera = Camera(
+            name,
+            arm.seen_by.lens,
+            rows,
+            t_ns,
+            np.ones(len(rows), dtype=np.bool_),
+            Trajectory(t_ns, logged.position[:, k], attitude),
+            static=False,
+            sigma=logged.pose_sigma[:, k],
+            detections=found,
+        )
+        with np.load(part / "background.npz") as stored:
+            tracks = Tracks(stored["picture"], stored["point"], stored["xy"])
+            greys: Picture = stored["greys"]
+        tracks = off_people(tracks, people_boxes(camera))
+        cameras.append(camera)
+        followed[name] = Followed(rows, rows[:1], [partial(replace, tracks)])
+        stills[name] = Stills(_stills(t_ns), greys.__getitem__)
+    errors, between = pose_errors(arm.noise), _between(t_ns)
+    if arm.noise:
+        cameras, _, _ = refine_cameras(cameras, followed, [errors] * len(cameras), between=between)
+        cameras = bind_positions(cameras, followed, stills, between=between).cameras
+    return [replace(of, errors=of.errors or errors) for of in cameras]
+
+
+def _between(t_ns: Int64) -> Interpolation:
+    return Interpolation(max_gap_s=float(np.ptp(t_ns)) / 1e9, max_extrapolation_s=0.0)
+
+
 def _measured(
-    arm: _Arm, of: Walk, sightings: SimulatedKeypoints, *, seed: int
+    arm: _Arm,
+    of: Walk,
+    sightings: SimulatedKeypoints,
+    cameras: Sequence[Sequence[Camera]],
+    *,
+    seed: int,
 ) -> tuple[Float, MeasuredJoints, dict[str, Any]]:
-    """Reconstruct a person [T, J, 3], with errors in several draws, and measure the arm by them."""
+    """Reconstruct a person [T, J, 3] in cameras [K, N] of K draws, with errors, and measure the arm."""
     elapsed_s = (of.t_ns - of.t_ns[0]) / 1e9
 
     def reconstructed(draw: int) -> tuple[Float, str | None]:
+        own = cameras[draw]
         views = views_of(of, arm.seen_by, sightings, arm.noise, seed=seed, trial=draw)
-        _, found, doubt = refined_points(views, elapsed_s, of.person.joints, arm.noise)
+        poses = zip(*(camera.poses_at(of.t_ns, _between(of.t_ns)) for camera in own), strict=True)
+        position, rotation = (np.stack(part, axis=1) for part in poses)
+        sigma = np.stack([np.asarray(camera.sigma) for camera in own], axis=1)
+        views = replace(views, position=position, rotation=rotation, pose_sigma=sigma)
+        prior = [errors for camera in own if (errors := camera.errors) is not None]
+        corrected = any(camera.modes is not None for camera in own)
+        joints = of.person.joints
+        _, found, doubt = refined_points(views, elapsed_s, joints, prior, measured=corrected)
         return found.reshape(of.joints.shape), doubt
 
     points, doubt = reconstructed(0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations, pairwise
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -17,8 +18,25 @@ import pandas as pd
 
 from pipelines.geometry.arrays import Bool, Float, Float32, Int64, Intrinsics
 from pipelines.geometry.cameras import project, undistort
-from pipelines.geometry.noise import NoiseModel, disturb, pose_errors, sum_sigma
-from pipelines.geometry.poses import invert, look_at, matrix_from_quaternion, rates, transform
+from pipelines.geometry.noise import (
+    EXACT,
+    ROTATION,
+    SHIFT_IN_CAMERA,
+    NoiseModel,
+    Process,
+    disturb,
+    pose_errors,
+)
+from pipelines.geometry.poses import (
+    conjugate,
+    cross_matrix,
+    invert,
+    look_at,
+    matrix_from_quaternion,
+    multiply,
+    rotation_vector_from_quaternion,
+    transform,
+)
 from pipelines.geometry.triangulation import PIXEL_SIGMA_PX, Views, triangulate
 from pipelines.planning.arms import Arm, RollingOut
 from pipelines.planning.config import MOST_DRONES, PlannerConfig
@@ -321,6 +339,14 @@ FARTHEST_M = 100.0
 LEAST_INFORMATION = 1e-6
 # And so does this share of the stiffness, where that is larger.
 LEAST_OF_STIFFNESS = 1e-10
+# A person's feet are about this far below the middle of the hips: there cameras see the same ground.
+HIPS_ABOVE_GROUND_M = 0.9
+# Two cameras place the same ground this differently on each axis, when the ground has bound them.
+GROUND_SIGMA_M = 0.015
+# What backgrounds leave of changing errors (m, rad): the least levels that `background` estimates.
+BACKGROUND_SIGMA = (1e-3, 1e-4)
+# Slow errors are linear between knots at least this far apart, and these are at most so many.
+KNOT_S, MOST_KNOTS = 2.0, 40
 # One random stream for each: poses err alike in every measurement, however many numbers a detector draws.
 POSES, KEYPOINTS = range(2)
 # Keypoints below this confidence are left out, as in `mocap reconstruct`.
@@ -534,9 +560,9 @@ def measure(
 ) -> MeasuredJoints:
     """Measure a skeleton in several trials; sight is tested in the map of each moment.
 
-    Joints are triangulated by `robust`, and their errors smoothed as the joint estimate does. The last
-    `start_m` of a sight line, next to the joint, is left out: maps contain the person. Trial k of camera i
-    has the same random numbers for any other path.
+    Joints are triangulated by `robust` in the true poses and smoothed; the error that `auto` leaves of poses
+    is added (`_Smoother`). The last `start_m` of a sight line, next to the joint, is left out: maps contain
+    the person. Trial k of camera i has the same random numbers for any other path.
     """
     joints = paths.joints
     cameras, times, count = len(paths.position), *joints.shape[:2]
@@ -551,20 +577,19 @@ def measure(
     if paths.others is not None and len(paths.others):
         eyes, others = paths.position[:, :, None], paths.others[:, None, :, None]
         free &= ~hidden_by_people(eyes, standing_in, others)
-    sigma = np.stack([_pose_sigma(paths, i) for i in range(cameras)], axis=1)
-    error = np.full((trials, times, count), np.nan, dtype=np.float32)
+    own = np.full((trials, times, count, 3), np.nan, dtype=np.float32)
+    logged, passed = np.empty((trials, times, cameras, 6)), np.empty((trials, times, cameras, 3))
     smoother = _Smoother(paths, standing_in)
+    true_rotation = matrix_from_quaternion(paths.quaternion_xyzw)
     for trial in range(trials):
         rays = np.empty((times, count, cameras, 2))
         weight = np.empty((times, count, cameras))
-        logged_position, logged_rotation = np.empty((times, cameras, 3)), np.empty((times, cameras, 3, 3))
         for i, lens in enumerate(paths.intrinsics):
-            path = paths.position[i]
-            logged_position[:, i], turned = disturb(
-                *(paths.noise[i], paths.t_ns, path, paths.quaternion_xyzw[i]),
-                np.random.default_rng([seed, POSES, trial, i]),
-            )
-            logged_rotation[:, i] = matrix_from_quaternion(turned)
+            path, attitude = paths.position[i], paths.quaternion_xyzw[i]
+            rng = np.random.default_rng([seed, POSES, trial, i])
+            shifted, turned = disturb(paths.noise[i], paths.t_ns, path, attitude, rng)
+            logged[trial, :, i, :3] = shifted - path
+            logged[trial, :, i, 3:] = rotation_vector_from_quaternion(multiply(conjugate(attitude), turned))
             rng = np.random.default_rng([seed, KEYPOINTS, trial, i, paths.person])
             xy, confidence = detect(pixels[i], free[i], path, paths.middle, joints, _focal(lens), rng)
             rays[:, :, i] = undistort(xy, lens)
@@ -573,25 +598,30 @@ def measure(
             rays=rays.reshape(-1, cameras, 2),
             weight=weight.reshape(-1, cameras),
             pose_index=np.repeat(np.arange(times), count),
-            position=logged_position,
-            rotation=logged_rotation,
+            position=paths.position.swapaxes(0, 1),
+            rotation=true_rotation.swapaxes(0, 1),
             focal=np.array([_focal(lens) for lens in paths.intrinsics]),
             pixel_sigma=np.full(cameras, PIXEL_SIGMA_PX),
-            pose_sigma=sigma,
+            pose_sigma=np.zeros((times, cameras, 2)),
         )
         found = triangulate(views, method="robust", with_covariance=False)
         off = found.points.reshape(joints.shape) - joints
-        off = smoother.smoothed(off, found.inlier.reshape(times, count, cameras))
-        error[trial] = np.sqrt(np.sum(off**2, axis=-1))
+        seen = found.inlier.reshape(times, count, cameras) & np.isfinite(off[..., :1])
+        passed[trial] = smoother.passed(rays, seen)
+        own[trial] = smoother.own(off, seen)
+    error = np.linalg.norm(own + smoother.shared(passed, logged)[:, :, None], axis=-1).astype(np.float32)
     return MeasuredJoints(error, int(known.sum()))
 
 
 class _Smoother:
-    """Smoothing over time by which the joint estimate reduces errors that change from picture to picture.
+    """Errors that the joint estimate leaves of triangulated joints.
 
-    The error that all joints share, and the rest of each, are smoothed by the least accelerations, as large
-    as those of the joints, that agree with the information of the views: keypoints for the rest, keypoints
-    and white pose noise for what is shared. Constant and slow pose errors stay.
+    Each joint's own error is smoothed by the least accelerations, as large as those of the joints, that agree
+    with its keypoints. The error that all joints share is that of a linear estimate with the unknowns and the
+    evidence of `auto`. Its background leaves each camera a shift, a rotation and a scale of its whole path
+    about its middle (7 numbers). Unknown are these, the constant and slow errors of the log, and the shared
+    error at each time. Evidence are the log, the ground that cameras share near the person, the mean keypoint
+    of each picture, and the smoothness of the shared error.
     """
 
     def __init__(self, paths: CameraPaths, joints: Float) -> None:
@@ -605,30 +635,146 @@ class _Smoother:
         )
         least = np.maximum(FAST_MOTION * np.sqrt(square / 3.0), MIN_ACCELERATION_MPS2)
         self._stiffness = 1.0 / (least * step_s**2) ** 2
-        pixel = np.array([(PIXEL_SIGMA_PX / _focal(lens)) ** 2 for lens in paths.intrinsics])[:, None]
-        white = np.square([pose_errors(models).white for models in paths.noise])[:, None]
+        self._paths, self._joints = paths, joints
+        self._pixel = np.array([(PIXEL_SIGMA_PX / _focal(lens)) ** 2 for lens in paths.intrinsics])[:, None]
         across, square_m2 = _across_ray(paths.position[:, :, None] - joints)
-        self._information = across / (pixel[..., None] * square_m2)[..., None, None]  # [N, T, J, 3, 3]
-        self._across, square_m2 = _across_ray(paths.position - paths.middle)
-        self._pixel = pixel * square_m2  # [N, T]
-        self._pose = white[..., 0] + white[..., 1] * square_m2
+        self._information = across / (self._pixel[..., None] * square_m2)[..., None, None]  # [N, T, J, 3, 3]
 
-    def smoothed(self, off: Float, seen: Bool) -> Float:
-        """Smooth errors [T, J, 3] m of joints that cameras see, [T, J, N]; NaN stays."""
-        if len(off) < MIN_SMOOTHED_TIMES:
-            return off
+    def passed(self, rays: Float, seen: Bool) -> Float:
+        """Compute by how much (m) rays [T, J, N, 2] pass joints that are seen [T, J, N]: means [T, N, 3]."""
+        rotation = matrix_from_quaternion(self._paths.quaternion_xyzw)
+        along = np.einsum("ntab,tjnb->ntja", rotation, np.append(rays, np.ones_like(rays[..., :1]), axis=-1))
+        along /= np.linalg.norm(along, axis=-1, keepdims=True)
+        away = self._joints - self._paths.position[:, :, None]
+        past = along * (along * away).sum(axis=-1, keepdims=True) - away
+        where = seen.transpose(2, 0, 1)
+        total = np.where(where[..., None], past, 0.0).sum(axis=2)
+        count = where.sum(axis=2)[..., None]
+        mean: Float = np.where(count > 0, total / np.maximum(count, 1), np.nan).swapaxes(0, 1)
+        return mean
+
+    def own(self, off: Float, seen: Bool) -> Float:
+        """Smooth what errors [T, J, 3] m do not share, of joints that cameras see, [T, J, N]; NaN stays."""
         there = np.isfinite(off[..., 0])
-        seen = seen & there[..., None]
         own = np.einsum("tjc,ctjab->tjab", seen.astype(np.float64), self._information)
         total = own.sum(axis=1) + np.eye(3) / FARTHEST_M**2
         weighted = np.einsum("tjab,tjb->ta", own, np.where(there[..., None], off, 0.0))
         shared = np.linalg.solve(total, weighted[..., None])[:, None, :, 0]
-        count = seen.sum(axis=1).T
-        variance = self._pixel / np.maximum(count, 1) + self._pose
-        common = np.sum(np.where(count > 0, 1.0 / variance, 0.0)[..., None, None] * self._across, axis=0)
-        series = np.concatenate([shared, np.where(there[..., None], off - shared, 0.0)], axis=1)
-        smooth(series, np.concatenate([common[:, None], own], axis=1), self._stiffness)
-        return np.where(there[..., None], series[:, :1] + series[:, 1:], np.nan)
+        series = np.where(there[..., None], off - shared, 0.0)
+        if len(off) >= MIN_SMOOTHED_TIMES:
+            for j, stiff in enumerate(self._stiffness[1:]):
+                right = np.einsum("tab,tb->ta", own[:, j], series[:, j])
+                series[:, j] = smooth(right[..., None], own[:, j], stiff)[..., 0]
+        return np.where(there[..., None], series, np.nan)
+
+    def shared(self, passed: Float, logged: Float) -> Float:
+        """Compute the error [K, T, 3] m that all joints share, in K trials.
+
+        Keypoints pass joints by `passed` [K, T, N, 3] m on average, NaN where none was found; `logged`
+        [K, T, N, 6] are the errors of the log, positions in the world (m) and rotations in the camera (rad).
+        """
+        paths, (trials, times, cameras) = self._paths, passed.shape[:3]
+        across, square_m2 = _across_ray(paths.position - paths.middle)
+        often = np.isfinite(passed[..., 0]).mean(axis=0).T > 0.5  # [N, T]
+        sure = often * self._joints.shape[1] / (self._pixel * square_m2)
+        weight = across * sure[..., None, None]  # [N, T, 3, 3]
+        gaps = pd.DataFrame(passed.swapaxes(0, 1).reshape(times, -1))
+        filled = gaps.interpolate(limit_direction="both").fillna(0.0).to_numpy().reshape(times, trials, -1, 3)
+        seen = np.einsum("ntab,tknb->ntak", weight, filled)
+        own = [self._unknowns(i) for i in range(cameras)]
+        ends = np.cumsum([0, *(of.prior.shape[0] for of in own)])
+        normal, right = np.zeros((ends[-1], ends[-1])), np.zeros((ends[-1], trials))
+        pulled = np.zeros((times, 3, ends[-1]))
+        columns = [slice(first, stop) for first, stop in pairwise(ends.tolist())]
+        for i, (of, mine) in enumerate(zip(own, columns, strict=True)):
+            pulled[..., mine] = weight[i] @ of.at_person
+            normal[mine, mine] = of.prior + _squared(of.of_log, of.of_log)
+            normal[mine, mine] += _squared(of.at_person, pulled[..., mine])
+            errors = logged[:, :, i].transpose(1, 2, 0) / of.log_sigma[:, None]
+            right[mine] = _squared(of.of_log, errors) - _squared(of.at_person, seen[i])
+        for (one, a), (other, b) in combinations(list(zip(own, columns, strict=True)), 2):
+            for x, y, left, top in ((one, one, a, a), (other, other, b, b), (one, other, a, b)):
+                both = _squared(x.at_ground, y.at_ground) / (times * GROUND_SIGMA_M**2)
+                normal[left, top] += both if left == top else -both
+            normal[b, a] = normal[a, b].T
+        # The shared error is eliminated: it is smooth, whatever the cameras are.
+        sides = np.concatenate([seen.sum(axis=0), pulled], axis=-1)
+        smoothed = smooth(sides, weight.sum(axis=0), self._stiffness[0])
+        normal -= _squared(pulled, smoothed[..., trials:])
+        right += _squared(pulled, smoothed[..., :trials])
+        normal[np.diag_indices_from(normal)] += LEAST_INFORMATION
+        found = np.linalg.solve(normal, right)
+        error: Float = (smoothed[..., :trials] + smoothed[..., trials:] @ found).transpose(2, 0, 1)
+        return error
+
+    def _unknowns(self, i: int) -> _Unknowns:
+        """Build the equations of one camera: 7 numbers, then the constant and slow errors of its log."""
+        paths, errors = self._paths, pose_errors(self._paths.noise[i])
+        t_s = (paths.t_ns - paths.t_ns[0]) / 1e9
+        knots = min(int(t_s[-1] / KNOT_S) + 2, MOST_KNOTS)
+        position, rotation = paths.position[i], matrix_from_quaternion(paths.quaternion_xyzw[i])
+        centre = position.mean(axis=0)
+        at_person = _moved(paths.middle - centre)
+        at_person[..., 6] = position - centre  # pictures show directions, not the scale
+        ground = paths.middle - centre - [0.0, 0.0, HIPS_ABOVE_GROUND_M]
+        of_log: list[Float] = [np.zeros((len(t_s), 6, 7))]
+        of_log[0][:, :3] = _moved(position - centre)
+        of_log[0][:, 3:, 3:6] = rotation.swapaxes(1, 2)
+        priors: list[Float] = [np.zeros((7, 7))]
+        for process in errors.processes:
+            basis, prior = _over_time(process, t_s, knots)
+            axes = rotation if process.number == SHIFT_IN_CAMERA else np.tile(np.eye(3), (len(t_s), 1, 1))
+            columns = np.zeros((len(t_s), 6, 3 * len(prior)))
+            first = 3 if process.number == ROTATION else 0
+            columns[:, first : first + 3] = np.einsum("tk,tab->takb", basis, axes).reshape(len(t_s), 3, -1)
+            of_log.append(columns)
+            priors.append(np.asarray(np.kron(prior, np.eye(3)), dtype=np.float64))
+        log_sigma = np.repeat(np.maximum(errors.white_with_stray(t_s[-1] / (knots - 1)), BACKGROUND_SIGMA), 3)
+        from scipy.linalg import block_diag
+
+        prior = block_diag(*priors)
+        none = np.zeros((len(t_s), 3, len(prior) - 7))
+        return _Unknowns(
+            prior,
+            np.concatenate(of_log, axis=-1) / log_sigma[:, None],
+            log_sigma,
+            np.append(at_person, none, axis=-1),
+            np.append(_moved(ground), none, axis=-1),
+        )
+
+
+class _Unknowns(NamedTuple):
+    """Equations of the M unknowns of one camera."""
+
+    prior: Float  # [M, M] precision
+    of_log: Float  # [T, 6, M] errors of logged poses, in standard deviations
+    log_sigma: Float  # [6] these, m and rad
+    at_person: Float  # [T, 3, M] m, displacement of what it sees at the person
+    at_ground: Float  # [T, 3, M] m, and at the ground below
+
+
+def _moved(place: Float) -> Float:
+    """Compute by how much a shift, a rotation and a scale about the origin move places, [T, 3, 7]."""
+    shift = np.broadcast_to(np.eye(3), (len(place), 3, 3))
+    return np.concatenate([shift, -cross_matrix(place), place[..., None]], axis=-1)
+
+
+def _over_time(process: Process, t_s: Float, knots: int) -> tuple[Float, Float]:
+    """Return how much each knot of a process counts at times, [T, K], and the knots' precision [K, K]."""
+    if process.constant:
+        return np.ones((len(t_s), 1)), np.full((1, 1), process.sigma0**-2)
+    at_s = np.linspace(0.0, t_s[-1], knots)
+    kept, variance = process.step(float(at_s[1]))
+    steps = np.eye(knots) - kept * np.eye(knots, k=-1)
+    steps[0] /= max(process.sigma0, EXACT)
+    steps[1:] /= max(np.sqrt(variance), EXACT)
+    return np.stack([np.interp(t_s, at_s, hat) for hat in np.eye(knots)], axis=1), steps.T @ steps
+
+
+def _squared(one: Float, other: Float) -> Float:
+    """Sum products of [T, A, M] and [T, A, K] over times and axes, [M, K]."""
+    product: Float = one.reshape(-1, one.shape[-1]).T @ other.reshape(-1, other.shape[-1])
+    return product
 
 
 def _across_ray(offset: Float) -> tuple[Float, Float]:
@@ -637,23 +783,23 @@ def _across_ray(offset: Float) -> tuple[Float, Float]:
     return np.eye(3) - offset[..., :, None] * offset[..., None, :] / square[..., None, None], square
 
 
-def smooth(series: Float, information: Float, stiffness: Float) -> None:
-    """Minimise sum (x - y)' W (x - y) + stiffness sum |x''|^2 for series [T, S, 3], W [T, S, 3, 3] or 0."""
+def smooth(right: Float, information: Float, stiffness: float) -> Float:
+    """Minimise sum x' W x / 2 - x' r + stiffness sum |x''|^2 / 2 for r [T, 3, K] and W [T, 3, 3] or 0."""
     from scipy.linalg import solveh_banded
 
-    bend = np.zeros((3, len(series), 1))  # squares of second differences by lag, 0 to 2, and the later time
+    times = len(right)
+    bend = np.zeros((3, times, 1))  # squares of second differences by lag, 0 to 2, and the later time
     bend[0, :-2] += 1.0
     bend[0, 1:-1] += 4.0
     bend[:, 2:] += np.array([1.0, -2.0, 1.0])[:, None, None]
     bend[1, 1:-1] -= 2.0
-    for s, stiff in enumerate(stiffness):
-        band = np.zeros((7, len(series), 3))
-        for a, b in zip(*np.tril_indices(3), strict=True):
-            band[6 - a + b, :, a] = information[:, s, a, b]
-        band[[6, 3, 0]] += stiff * bend
-        band[6] += LEAST_INFORMATION + LEAST_OF_STIFFNESS * stiff
-        right = np.einsum("tab,tb->ta", information[:, s], series[:, s])
-        series[:, s] = solveh_banded(band.reshape(7, -1), right.ravel()).reshape(-1, 3)
+    band = np.zeros((7, times, 3))
+    for a, b in zip(*np.tril_indices(3), strict=True):
+        band[6 - a + b, :, a] = information[:, a, b]
+    if times >= MIN_SMOOTHED_TIMES:
+        band[[6, 3, 0]] += stiffness * bend
+    band[6] += LEAST_INFORMATION + LEAST_OF_STIFFNESS * stiffness
+    return solveh_banded(band.reshape(7, -1), right.reshape(3 * times, -1)).reshape(right.shape)
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
@@ -669,13 +815,6 @@ def _pixels(paths: CameraPaths, i: int) -> Float:
     pixels = project(transform(camera_from_world, paths.joints), lens)
     inside = (pixels >= -0.5) & (pixels <= np.array([lens.width, lens.height]) - 0.5)
     return np.where(inside.all(axis=-1, keepdims=True) & paths.known[i, :, None, None], pixels, np.nan)
-
-
-def _pose_sigma(paths: CameraPaths, i: int) -> Float:
-    """Compute the sigmas [T, 2] per axis (m, rad) of one camera's poses for triangulation."""
-    path, turned = paths.position[i], paths.quaternion_xyzw[i]
-    elapsed_s = (paths.t_ns - paths.t_ns[0]) / 1e9
-    return sum_sigma(paths.noise[i], elapsed_s, *rates(paths.t_ns, path, turned))
 
 
 def _focal(lens: Intrinsics) -> float:

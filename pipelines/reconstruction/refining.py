@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.noise import WHITE_SHARE, NoiseModel, PoseErrors, pose_errors
+from pipelines.geometry.noise import WHITE_SHARE, PoseErrors
 from pipelines.geometry.triangulation import (
     PIXEL_SIGMA_PX,
     STATUS,
@@ -689,14 +689,19 @@ def _camera_table(flight: RobustFlight, refined: Refined, offset_s: Float) -> pd
 
 
 def refined_points(
-    views: Views, t_s: Float, joints: tuple[str, ...], models: Sequence[NoiseModel]
+    views: Views,
+    t_s: Float,
+    joints: tuple[str, ...],
+    prior: Sequence[PoseErrors],
+    *,
+    measured: bool = False,
 ) -> tuple[Views, Float, str | None]:
-    """Estimate the points of one person in moving cameras without pictures and with right clocks.
+    """Estimate the points of one person in moving cameras with right clocks, by `refined`.
 
-    There `auto` is `refined`, and `robust` where that is refused. Views are N = T * J joint-frames, joints
-    fastest, with a row of poses for each of the T times; `models` are the pose noise of every camera. Return
-    the views with estimated noise and corrected poses, points [N, 3] m (NaN: none), and the reason of a
-    fallback.
+    Where that is refused, `robust` stays. Views are N = T * J joint-frames, joints fastest, with a row of
+    poses for each of the T times; the `prior` of each camera's pose errors was `measured` if its background
+    corrected its poses. Return the views with estimated noise and corrected poses, points [N, 3] m (NaN:
+    none), and the reason of a fallback.
     """
     times, cameras = views.position.shape[:2]
     noisy = replace(views, pixel_sigma=estimate_noise(views))
@@ -713,9 +718,15 @@ def refined_points(
         )
         for c in range(cameras)
     ]
-    prior = [pose_errors(models)] * cameras
-    shape = (times, len(joints), 3)
-    found = refine(t_s, sightings, start.reshape(shape), rigid_pairs(joints, 1), prior, np.zeros(cameras))
+    found = refine(
+        t_s,
+        sightings,
+        start.reshape(times, len(joints), 3),
+        rigid_pairs(joints, 1),
+        prior,
+        np.zeros(cameras),
+        measured=measured,
+    )
     if found.fallback is not None:
         return noisy, start, found.fallback
     position, rotation = views.position.copy(), views.rotation.copy()
