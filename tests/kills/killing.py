@@ -84,8 +84,7 @@ def commands_on(folder: Path) -> dict[str, Command]:
         "simulate": Command(["simulate", folder / "scenario.yaml", "-o", simulated], simulated),
         "study": Command(["study", *SMALL_STUDY, "-o", studied], studied),
         "batch": Command(
-            ["batch", manifest, "-o", batched, "--stages", "ingest,reconstruct", *detection],
-            batched,
+            ["batch", manifest, "-o", batched, "--stages", "ingest,reconstruct", *detection], batched
         ),
     }
 

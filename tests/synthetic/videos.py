@@ -69,7 +69,7 @@ def write_video(
         stream.time_base = stream.codec_context.time_base = TICK_S
         options = {"g": str(key_every), "bf": str(b_frames)}
         if codec == "libx264":
-            options |= {"preset": "ultrafast", "sc_threshold": "0"}
+            options |= {"preset": "ultrafast", "sc_threshold": "0", "qp": "23"}
         stream.codec_context.options = options if codec != "mjpeg" else {}
         if turned_deg:
             stream.set_display_rotation(turned_deg)

@@ -498,7 +498,7 @@ def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
     if scan.is_raw and codec != "mjpeg":
         notes += (
             "a raw stream has no times: lost pictures are counted by what the others say of their order,"
-            " which may be wrong next to a key frame",
+            " which may be wrong next to a key frame, and nothing shows a lost group of pictures",
         )
     if scan.damaged:
         notes += (
@@ -526,6 +526,14 @@ def _nanoseconds(ticks: Int64, tick_s: Fraction, origin: int = 0) -> Int64:
 
 
 # --- order of raw streams --------------------------------------------------------------------------------
+
+
+class _Order(NamedTuple):
+    """Place of a coded picture in the order of showing."""
+
+    sequence: int  # from one key frame that refers to nothing before it to the next
+    place: int | None  # picture order count in the sequence; None if it is not known
+    is_whole: bool  # False if the key frame of the sequence is lost
 
 
 class _Bits:
@@ -564,33 +572,36 @@ _Sets = dict[int, tuple[int, ...]]
 _HEADER_BYTES = 1024
 
 
-def _orders(coded: Iterator[Packet[VideoStream]], codec: str, given: set[int]) -> dict[int, tuple[int, int]]:
-    """Read the sequence of each coded picture and its count in it, by number of packet, from its header."""
-    orders: dict[int, tuple[int, int]] = {}
+def _orders(coded: Iterator[Packet[VideoStream]], codec: str, given: set[int]) -> dict[int, _Order]:
+    """Read the place of each coded picture in the order of showing, by number of packet, from its header."""
+    orders: dict[int, _Order] = {}
     streams: _Sets = {}
     pictures: _Sets = {}
-    sequence, reference = -1, 0
+    sequence, is_whole, reference = -1, False, 0
     seen: set[int] = set()
     for number, packet in enumerate(coded):
         try:
             found = _HEADS[codec](bytes(packet), streams, pictures)
         except (ValueError, KeyError):  # a damaged header, or MJPEG, which has none
-            continue
+            found = None
         if found is None or (found.is_field and number not in given):
             continue
         # The count of least distance to that of the last reference (ITU-T H.264, 8.2.1; H.265, 8.3.1).
         half = found.modulus // 2
         step = (found.place - reference + half) % found.modulus - half
-        count, is_given = reference + step, number in given
-        if not (found.starts or is_given) and abs(step) > _NEAR:
-            continue  # damaged
+        if not (found.starts or number in given or abs(step) <= _NEAR < found.modulus / 4):
+            orders[number] = _Order(sequence, None, is_whole)
+            continue
+        count = found.place if found.starts else reference + step
+        if not found.starts and count in seen and step + found.modulus <= 3 * found.modulus // 4:
+            count += found.modulus  # references were lost
         # A count that was there before is that of a sequence whose first picture is lost.
-        if found.starts or (count in seen and is_given) or sequence < 0:
-            sequence, count, seen = sequence + 1, found.place, set()
-        seen |= {count} if is_given else set()
-        orders[number] = sequence, count
-        if found.is_reference or found.starts:
-            reference = count
+        if found.starts or count in seen or sequence < 0:
+            sequence, is_whole, seen = sequence + 1, found.starts, set()
+            count = found.place
+        seen.add(count)
+        orders[number] = _Order(sequence, count, is_whole)
+        reference = count if found.is_reference or found.starts else reference
     return orders
 
 
@@ -697,31 +708,46 @@ def _units(packet: bytes) -> Iterator[bytes]:
     return (unit[:_HEADER_BYTES] for unit in packet.split(b"\0\0\1")[1:] if len(unit) > 2)
 
 
-def _numbers_by_order(found: list[int], orders: dict[int, tuple[int, int]]) -> Int64:
+def _numbers_by_order(found: list[int], orders: dict[int, _Order]) -> Int64:
     """Number decoded pictures [N] (numbers of packets) from 0 as they were taken, lost ones among them.
 
     Without orders the packets are counted. Sequences of one length that end up to three pictures early lost
     these.
     """
-    if not orders.keys() >= set(found):
-        by_packets: Int64 = np.sort(np.array(found, np.int64)) - min(found)
+    by_packets: Int64 = np.sort(np.array(found, np.int64)) - min(found)
+    sequences: dict[int, list[int]] = {}
+    unplaced: dict[int, int] = {}  # pictures after the last that is placed
+    first = next((each.place for each in orders.values() if each.is_whole), 0) or 0
+    for each in orders.values():
+        counts = sequences.setdefault(each.sequence, [] if each.is_whole else [first])
+        if not each.is_whole:  # what was not given before it belongs to it
+            unplaced[each.sequence - 1] = 0
+        unplaced[each.sequence] = unplaced.get(each.sequence, 0) + 1 if each.place is None else 0
+        counts += [] if each.place is None else [each.place]
+    places = [order.place for number in found if (order := orders.get(number))]
+    if len(places) < len(found):
         return by_packets
-    counts: dict[int, list[int]] = {}
-    for sequence, count in orders.values():
-        counts.setdefault(sequence, []).append(count)
-    steps = [step for each in counts.values() for step in np.diff(np.unique(each)).tolist()]
+    steps = [step for counts in sequences.values() for step in np.diff(np.unique(counts)).tolist()]
     step = max(set(steps), key=steps.count) if steps else 1
-    lengths = [(max(each) - min(each)) // step + 1 for each in counts.values()]
+    lengths = [
+        round((max(counts) - min(counts)) / step) + 1 + unplaced[sequence]
+        for sequence, counts in sequences.items()
+    ]
     inner, usual = lengths[:-1], max(lengths)
     if 2 * lengths.count(usual) > len(inner) > 0 and min(inner) >= usual - _MOST_LOST:
         lengths = [usual] * len(inner)
-    begins = dict(zip(counts, np.cumsum([0, *lengths]).tolist(), strict=False))
-    placed = [orders[number] for number in found]
-    taken = [begins[sequence] + (count - min(counts[sequence])) // step for sequence, count in placed]
-    index = np.arange(len(taken))
+    begins = dict(zip(sequences, np.cumsum([0, *lengths]).tolist(), strict=False))
+    taken = [
+        begins[orders[number].sequence] + round((place - min(sequences[orders[number].sequence])) / step)
+        for number, place in zip(found, places, strict=True)
+        if place is not None
+    ]
+    count = np.arange(len(taken))
     # A decoder that misses a key frame mixes the pictures around it.
-    numbers: Int64 = np.maximum.accumulate(np.sort(np.array(taken, np.int64)) - index) + index
-    return np.asarray(numbers - numbers[0], np.int64)
+    numbers: Int64 = np.maximum.accumulate(np.sort(np.array(taken, np.int64)) - count) + count
+    numbers -= numbers[0]
+    # Where a third of the pictures seems lost, headers are rather damaged.
+    return numbers if numbers[-1] < 1.5 * len(orders) else by_packets
 
 
 # --- decoding -----------------------------------------------------------------------------------------

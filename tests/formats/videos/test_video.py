@@ -289,6 +289,8 @@ def test_raw_streams_are_numbered_and_have_no_times(
         ("h264", 0, 12, {13: b"", 23: b""}),
         ("h264", 2, 12, {7: b"", 29: b""}),
         ("hevc", 0, 12, {20: b""}),
+        ("h264", 0, 12, {12: b""}),  # a key frame: of those behind it the decoder gives few or none
+        ("hevc", 2, 12, {11: b"", 12: b""}),
         ("hevc", 0, 108, {2: b""}),  # of which the decoder gives six pictures
     ],
 )
@@ -311,6 +313,15 @@ def test_pictures_that_a_raw_stream_lost_move_no_other(
         shown = [read_bar_code(picture) for _, picture in reader.frames()]
     t_s = (reader.index.pts_ns // 10**9).tolist()
     assert t_s[-4:] == shown[-4:] == [*range(count - 4, count)]
+
+
+def test_lost_groups_of_a_raw_stream_leave_no_trace(tmp_path: Path) -> None:
+    """A key frame counts from 0 again, so what is left is byte for byte a shorter recording."""
+    for path, count in ((tmp_path / "whole.h264", 48), (tmp_path / "short.h264", 24)):
+        write_video(path, even_ticks(count), draw=lambda _: np.full((96, 96, 3), 99, np.uint8))
+    content, places = (tmp_path / "whole.h264").read_bytes(), packets(tmp_path / "whole.h264")
+    assert content[: places[12][0]] + content[places[36][0] :] == path.read_bytes()
+    assert (READER.index(path).count, READER.index(path).dropped) == (24, {})
 
 
 def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
