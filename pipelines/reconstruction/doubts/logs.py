@@ -142,7 +142,7 @@ def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt |
     start, end = max(one.t_ns[0], other.t_ns[0]), min(one.t_ns[-1], other.t_ns[-1])
     if start >= end:
         return None
-    t_ns = np.linspace(start, end, _MOMENTS).astype(np.int64)
+    t_ns = start + np.linspace(0, end - start, _MOMENTS).astype(np.int64)
     places, turns = zip(*(_poses_at(track, t_ns) for track in (one, other)), strict=True)
     apart_m = float(np.median(np.linalg.norm(places[0] - places[1], axis=1)))
     cosine = np.clip(np.abs((turns[0] * turns[1]).sum(axis=1)), 0, 1)
