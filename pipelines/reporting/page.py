@@ -143,9 +143,9 @@ def _beside_the_flight(content: SessionContent) -> list[str]:
     if modelled is None or error is None:
         return []
     return [
-        "Compare errors of arms with each other alone: they are of triangulation, with errors of poses drawn"
-        f" anew. The flown arm has {wording.fixed(modelled, 0)} mm by them; this flight, with its poses"
-        f" corrected, {has} {wording.fixed(error, 0)} mm."
+        "Errors of arms are modelled, a mean over errors of poses that are drawn anew. The flown arm has"
+        f" {wording.fixed(modelled, 0)} mm so; this flight, with errors of its own,"
+        f" {has} {wording.fixed(error, 0)} mm."
     ]
 
 
