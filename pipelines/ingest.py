@@ -8,7 +8,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -41,7 +41,7 @@ from pipelines.session.maps import store_map
 from pipelines.session.people import joint_called
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.recognition import recognise
-from pipelines.session.records import JointMotion, Occupancy, Topic, Trajectory
+from pipelines.session.records import Detections, JointMotion, Occupancy, Topic, Trajectory, VideoIndex
 from pipelines.session.registries import MapFormat
 from pipelines.session.stages import Stage, StageRecord, locked, note_sources, usable_record
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
@@ -61,7 +61,14 @@ from pipelines.session.tables import (
     write_table,
 )
 from pipelines.session.urls import as_urls, located, media_path, named
-from pipelines.sources.attitudes import MAP_FILES, FilmOfCamera, TurnedByPictures, turned_by_pictures
+from pipelines.sources.attitudes import (
+    MAP_FILES,
+    FilmOfCamera,
+    TurnedByPictures,
+    UnposedCamera,
+    posed_by_people,
+    turned_by_pictures,
+)
 from pipelines.sources.attitudes import load_map as load_picture_map
 from pipelines.sources.attitudes import store_map as store_picture_map
 from pipelines.sources.cameras import FlightCameras
@@ -295,26 +302,18 @@ class _FlightReader:
 
     def _read_camera(self, name: str, folder: Path) -> CameraData:
         """Read all about one camera, and check the parts; a map of its pictures goes to the folder."""
-        camera = self._flight.cameras[name]
-        video = self._files.video(camera)
-        detections, detector_format = None, ""
-        if camera.keypoints:
-            detections, detector_format = self._files.keypoints(camera.keypoints)
-        intrinsics = self._cameras.intrinsics(name, camera, video, detections)
-        if detections is not None:
-            if camera.keypoints:
-                detections = without_zeros(detections)
-                detections = in_pixels(detections, intrinsics, camera.keypoints.file)
-                detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics)
-            detections = near_picture(detections, intrinsics)
-        frames = self._cameras.frames(name, camera, video, detections)
-        trajectory = self.poses.trajectory(name, camera, frames)
-        pose_noise = camera.pose_noise
+        camera, video, detections, detector_format, intrinsics, frames = self._filmed(name)
+        pose_noise, turned = camera.pose_noise, None
         if pose_noise:
             noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", pose_noise)
+        if not camera.pose.file:
+            turned = self._posed_by_people[name]
+        else:
+            trajectory = self.poses.trajectory(name, camera, frames)
+            if camera.pose.by_pictures:
+                turned = self._turned_by_pictures(name, camera, frames, intrinsics, trajectory)
         picture_map = None
-        if camera.pose.by_pictures:
-            turned = self._turned_by_pictures(name, camera, frames, intrinsics, trajectory)
+        if turned is not None:
             trajectory, intrinsics, pose_noise = turned.trajectory, turned.intrinsics, turned.pose_noise
             picture_map = turned.entry
             store_picture_map(turned.map, folder)
@@ -344,6 +343,71 @@ class _FlightReader:
             picture_map=picture_map,
         )
 
+    def _filmed(
+        self, name: str
+    ) -> tuple[CameraSources, VideoIndex | None, Detections | None, str, Intrinsics, CameraFrames]:
+        """Read a camera's pictures, keypoints (and their format), lens and times."""
+        camera = self._flight.cameras[name]
+        video = self._files.video(camera)
+        detections, detector_format = None, ""
+        if camera.keypoints:
+            detections, detector_format = self._files.keypoints(camera.keypoints)
+        intrinsics = self._cameras.intrinsics(name, camera, video, detections)
+        if detections is not None:
+            if camera.keypoints:
+                detections = without_zeros(detections)
+                detections = in_pixels(detections, intrinsics, camera.keypoints.file)
+                detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics)
+            detections = near_picture(detections, intrinsics)
+        frames = self._cameras.frames(name, camera, video, detections)
+        return camera, video, detections, detector_format, intrinsics, frames
+
+    @cached_property
+    def _posed_by_people(self) -> dict[str, TurnedByPictures]:
+        """Poses of all cameras by their films alone, where no log has any."""
+        noted, films = len(self._notes), {}
+        for name in self._flight.cameras:
+            camera, _, detections, _, intrinsics, frames = self._filmed(name)
+            films[name] = UnposedCamera(
+                self._film(camera, frames),
+                frames,
+                intrinsics,
+                detections,
+                camera.intrinsics.assumed,
+                partial(self._kept_map, name),
+            )
+        del self._notes[noted:]  # each camera is read again, and noted then
+        return posed_by_people(
+            f"{self._flight_path}: cameras", films, self._flight.stature_m, self._take_note, self.progress
+        )
+
+    def _film(self, camera: CameraSources, frames: CameraFrames) -> FilmOfCamera:
+        """Return the pictures from which a camera is mapped."""
+        video = camera.video
+        if video is None:
+            raise AssertionError("the manifest refuses it")
+        paths = self._flight.paths_of(video.file)
+        files = [located(self._flight_path.parent, path) for path in paths]
+        stamps = self._logs.settings(video.file).stamps if frames.topic else "header"
+        return FilmOfCamera(
+            hash_of([[self.hashes[path] for path in paths], frames.topic, stamps]),
+            partial(open_files, files, frames.topic, stamps),
+        )
+
+    def _kept_map(self, name: str, key: str) -> PictureMap | None:
+        """Return a camera's map of an earlier ingest, if it is that of this key."""
+        before = usable_record(self._session / INGEST.name / "stage.json")
+        if self.force or before is None:
+            return None
+        for stored in (f"cameras/{name}/{file}" for file in MAP_FILES):
+            path = self._session / stored
+            if not path.is_file() or before.outputs.get(stored) != sha256_of(path):
+                return None
+        entry = read_description(self._session).cameras[name].picture_map
+        if entry is None or entry.key != key:
+            return None
+        return load_picture_map(self._session / "cameras" / name, entry)
+
     def _turned_by_pictures(
         self,
         name: str,
@@ -353,42 +417,17 @@ class _FlightReader:
         places: Trajectory,
     ) -> TurnedByPictures:
         """Find the attitudes of a camera by its film, from the map of an earlier ingest if it has one."""
-        video = camera.video
-        if video is None:
-            raise AssertionError("the manifest refuses it")
-        paths = self._flight.paths_of(video.file)
-        files = [located(self._flight_path.parent, path) for path in paths]
-        stamps = self._logs.settings(video.file).stamps if frames.topic else "header"
-
-        def kept(key: str) -> PictureMap | None:
-            before = usable_record(self._session / INGEST.name / "stage.json")
-            if self.force or before is None:
-                return None
-            for stored in (f"cameras/{name}/{file}" for file in MAP_FILES):
-                path = self._session / stored
-                if not path.is_file() or before.outputs.get(stored) != sha256_of(path):
-                    return None
-            entry = read_description(self._session).cameras[name].picture_map
-            return (
-                load_picture_map(self._session / "cameras" / name, entry)
-                if entry and entry.key == key
-                else None
-            )
-
         return turned_by_pictures(
             f"{self._flight_path}: cameras.{name}",
             name,
-            FilmOfCamera(
-                hash_of([[self.hashes[path] for path in paths], frames.topic, stamps]),
-                partial(open_files, files, frames.topic, stamps),
-            ),
+            self._film(camera, frames),
             frames,
             intrinsics,
             places,
             refine_focal=camera.intrinsics.assumed,
             pose_noise=camera.pose_noise,
             satellite_sigma_m=self.poses.satellite_sigma_m(camera),
-            kept=kept,
+            kept=partial(self._kept_map, name),
             note=self._take_note,
             progress=self.progress,
         )

@@ -8,14 +8,17 @@ the sightings, the places with errors that are correlated in time, and a level h
 covariance is that of the attitudes.
 
 Each camera is mapped by itself: views of two drones that are 90 degrees apart share too little, and a joint
-map of the sample flight was wrong by 6 m.
+map of the sample flight was wrong by 6 m. Where no log has places, people whom several cameras see join
+their maps (`join_maps`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
+from functools import partial
+from itertools import combinations, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,6 +27,7 @@ import cv2
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Index, Int64, Intrinsics, Picture
+from pipelines.geometry.body_model import body_model
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import ROTATION, PoseErrors
 from pipelines.geometry.poses import (
@@ -36,10 +40,13 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotate,
 )
+from pipelines.geometry.rig import BONES
 from pipelines.reconstruction.background_tracks import Tracks, rays_at_stamps
+from pipelines.reconstruction.body_fit import landmarks_of
+from pipelines.reconstruction.solving import MIN_MOMENTS, away_by_size
 
 # Another number of features, pairs or key pictures gives other maps: kept maps of an older one are not used.
-REVISION = 3
+REVISION = 4
 
 # --- which pictures, and what is matched -----------------------------------------------------------------
 
@@ -90,6 +97,8 @@ MAX_MISFIT = 9.0
 FAR_PX = 2.0
 # Of right maps at most 10 % of the sightings are far, of wrong ones 26 % and more (20 rendered cameras).
 MAX_FAR_SHARE = 0.16
+# The same share before places adjust a map: at most 0.10 in 26 right ones, 0.24 and more in wrong ones.
+FAR_SHARE_TO_MAP_AGAIN = 0.12
 # Loss of sightings in the rounds of the adjustment, px: the map's bend first, the points' errors last.
 LOSS_ROUNDS_PX = (30.0, 6.0, 2.0)
 # Followed points drift together with their neighbours, and keep their error for a second. So many sightings
@@ -130,6 +139,46 @@ MAX_PLACE_GAP_S = 3.0
 MAX_PLACES = 300
 # Places further from the first fit than this many median distances jumped away, and are left out.
 MAX_MEDIAN_DISTANCES = 6.0
+
+# --- maps of several cameras, joined by the people whom they see ------------------------------------------
+
+JOINED = (
+    "nose",
+    *(
+        f"{side}_{part}"
+        for part in ("ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+        for side in ("left", "right")
+    ),
+)
+"""Joints by which maps are joined: those that most detectors have."""
+MIDDLES = ("nose", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+"""Points of people in which a detector that takes left for right does not err: middles of both sides."""
+SHOULDERS, ANKLES = MIDDLES.index("shoulder"), MIDDLES.index("ankle")
+# Before anything is known a camera is taken to look down by this, and a person to stand upright.
+FIRST_DOWN_DEG = 20.0
+# Headings between two cameras that are tried: the least squares converge from 45 deg.
+FIRST_HEADINGS = 8
+# A detector's joint is off by this in a person, m: two joints of two views are one within three times that.
+JOINT_SIGMA_M = 0.035
+# Errors of joints last while a camera looks from one side: so many are independent in a flight.
+INDEPENDENT_MOMENTS = 10.0
+# Shoulders stand above ankles to this in the mean of a flight: people who run lean forward.
+UPRIGHT_SIGMA_DEG = 6.0
+# Limbs of people of one stature differ by this in their sum, as detectors see them.
+LIMB_SIGMA_SHARE = 0.03
+# A path is from half a metre to a hundred metres long where anybody is filmed from it.
+SCALES_M = (0.3, 30.0)
+# Two cameras are placed by so many moments of a person, from each heading and then from the best one.
+PAIRED_MOMENTS = (8, 24)
+# More numbers of people in one camera are pieces of those who are followed longest.
+MOST_TRACKS = 3
+# Fewer common sightings of joints fit any similarity.
+MIN_COMMON_JOINTS = 50
+# Another person places two cameras as well if so many of the joints agree, and another heading if its cost is
+# so little higher; both are other places if cameras are turned by more beside each other.
+MAX_RIVAL_SHARE, MAX_RIVAL_COST, RIVAL_DEG = 0.8, 1.5, 15.0
+# Of joints of one person in right maps at most 3 % pass each other by more than three standard deviations.
+MIN_JOINED_SHARE = 0.8
 
 
 class NoAttitudesError(ValueError):
@@ -238,25 +287,69 @@ def features_of(picture: Picture, intrinsics: Intrinsics) -> KeyFeatures:
 def map_pictures(
     features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool = False
 ) -> PictureMap:
-    """Map key pictures by their features, refining a guessed focal length; NoAttitudesError: too few."""
+    """Map key pictures by their features, refining a guessed focal length; NoAttitudesError: too few.
+
+    A map of the global mapper that its own sightings contradict is made again by the incremental one, from
+    more pairs, and the better one counts.
+    """
+    found = _mapped(features, intrinsics, refine_focal=refine_focal)
+    if far_share(found, intrinsics) > FAR_SHARE_TO_MAP_AGAIN:
+        with suppress(NoAttitudesError):
+            again = _mapped(features, intrinsics, refine_focal=refine_focal, one_by_one=True)
+            found = min(found, again, key=partial(far_share, intrinsics=intrinsics))
+    return found
+
+
+def far_share(found: PictureMap, intrinsics: Intrinsics) -> float:
+    """Return the share of a map's sightings that are `FAR_PX` or more from their points."""
+    turn = matrix_from_quaternion(found.quaternion_xyzw)
+    focal_px = found.focal_ratio * (intrinsics.fx * intrinsics.fy) ** 0.5
+    focal_px *= shrinkage(intrinsics.width, intrinsics.height)
+    nowhere = np.empty((0, 0))
+    bundle = _Bundle(found, focal_px, nowhere, nowhere, nowhere)
+    at = found.position / found.size
+    off = bundle.residuals(at, turn, _triangulated(found, at, turn))[0]
+    return float((np.linalg.norm(off, axis=1) > FAR_PX).mean())
+
+
+def _mapped(
+    features: Sequence[KeyFeatures],
+    intrinsics: Intrinsics,
+    *,
+    refine_focal: bool,
+    one_by_one: bool = False,
+) -> PictureMap:
+    """Map by COLMAP: all pictures at once, or one by one from pairs of neighbours, too."""
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     focal_px = (intrinsics.fx * intrinsics.fy) ** 0.5
     with TemporaryDirectory() as folder:
         place = Path(folder)
-        matched = _matched_pairs(place / "features.db", features, intrinsics, focal_px)
+        least = 1 if one_by_one else MIN_PAIR_STEPS
+        matched = _matched_pairs(place / "features.db", features, intrinsics, focal_px, least)
         if matched < MIN_MAPPED_PICTURES:
             raise NoAttitudesError(
                 f"only {matched} pairs of its {len(features)} key pictures have {MIN_MATCHES} matches:"
                 " they are dark, blurred or without texture"
             )
-        options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=SEED)
-        options.mapper.num_threads = options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
-        options.mapper.bundle_adjustment.refine_focal_length = refine_focal
-        options.mapper.bundle_adjustment.refine_extra_params = False
         (place / "maps").mkdir()
-        found = pycolmap.global_mapping(place / "features.db", place, place / "maps", options=options)
+        where = place / "features.db", place, place / "maps"
+        if one_by_one:
+            several = pycolmap.IncrementalPipelineOptions(
+                num_threads=1,
+                random_seed=SEED,
+                ba_refine_focal_length=refine_focal,
+                ba_refine_extra_params=False,
+            )
+            found = pycolmap.incremental_mapping(*where, options=several)
+        else:
+            options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=SEED)
+            options.mapper.num_threads = 1
+            adjusting = options.mapper.bundle_adjustment
+            adjusting.ceres.solver_options.num_threads = 1
+            adjusting.refine_focal_length, adjusting.refine_extra_params = refine_focal, False
+            found = pycolmap.global_mapping(*where, options=options)
     model = max(found.values(), key=lambda each: each.num_reg_images(), default=None)
     mapped = 0 if model is None else model.num_reg_images()
     if model is None or mapped < max(MIN_MAPPED_PICTURES, MIN_MAPPED_SHARE * len(features)):
@@ -341,7 +434,7 @@ def _determines_focal(model: Any) -> bool:
 
 
 def _matched_pairs(
-    path: Path, features: Sequence[KeyFeatures], intrinsics: Intrinsics, focal_px: float
+    path: Path, features: Sequence[KeyFeatures], intrinsics: Intrinsics, focal_px: float, least_steps: int
 ) -> int:
     """Write features and matches as a database of pycolmap; return the number of pairs that match."""
     import pycolmap
@@ -374,7 +467,7 @@ def _matched_pairs(
             database.write_descriptors(image.image_id, described)
         ids.append(image.image_id)
     for first, second in combinations(range(len(features)) if film else (), 2):
-        if second - first >= MIN_PAIR_STEPS:
+        if second - first >= least_steps:
             points = features[first].point, features[second].point
             matches = np.stack(np.intersect1d(*points, return_indices=True)[1:], axis=1)
             if len(matches) >= MIN_MATCHES:
@@ -406,7 +499,7 @@ def _rooted(descriptors: Picture) -> Picture:
 
 
 @dataclass(frozen=True)
-class _Similarity:
+class Similarity:
     """World from map: scale, rotation and shift."""
 
     scale: float
@@ -414,6 +507,7 @@ class _Similarity:
     shift: Float  # [3] m
 
     def places(self, position: Float) -> Float:
+        """Move places [..., 3] of the map into the world."""
         return self.scale * rotate(self.quaternion_xyzw, position) + self.shift
 
 
@@ -437,7 +531,7 @@ def lay_on_places(
         raise NoAttitudesError(f"its log has {len(rows)} places while its pictures are mapped")
     seconds = (t_ns[rows] - at_ns[0]) / 1e9
     between = CubicSpline((at_ns - at_ns[0]) / 1e9, np.eye(len(at_ns)))(seconds)
-    start, fits = _first_similarity(between @ found.position, places[rows])
+    start, fits = first_similarity(between @ found.position, places[rows])
     between, logged, seconds = between[fits], places[rows][fits], seconds[fits]
     unstated = errors is None
     if errors is None:
@@ -497,7 +591,7 @@ def _bridged(at_ns: Int64, t_ns: Int64) -> Bool:
     return near
 
 
-def _first_similarity(mapped: Float, logged: Float) -> tuple[_Similarity, Bool]:
+def first_similarity(mapped: Float, logged: Float) -> tuple[Similarity, Bool]:
     """Compute a similarity by least squares (Umeyama 1991) of the places that fit it, and which these are."""
     fits = np.ones(len(mapped), dtype=np.bool_)
     for _ in range(4):
@@ -510,13 +604,13 @@ def _first_similarity(mapped: Float, logged: Float) -> tuple[_Similarity, Bool]:
         quaternion = quaternion_from_matrix(u * signs @ vt)
         scale = float((sizes * signs).sum() / np.square(left).sum())
         shift = target.mean(axis=0) - scale * rotate(quaternion, source.mean(axis=0))
-        fit = _Similarity(scale, quaternion, shift)
+        fit = Similarity(scale, quaternion, shift)
         apart = np.linalg.norm(fit.places(mapped) - logged, axis=1)
         fits = apart <= max(MAX_MEDIAN_DISTANCES * float(np.median(apart)), 1e-9)
     return fit, fits
 
 
-def _upright(start: _Similarity, mapped: Float, logged: Float, factor: Float, turned: Float) -> _Similarity:
+def _upright(start: Similarity, mapped: Float, logged: Float, factor: Float, turned: Float) -> Similarity:
     """Turn a similarity about the path's main direction, which hardly determines it, to a level horizon."""
     from scipy.linalg import solve_triangular
 
@@ -526,7 +620,7 @@ def _upright(start: _Similarity, mapped: Float, logged: Float, factor: Float, tu
     for angle in np.radians(np.arange(0, 360, TRIED_TURN_DEG)):
         turn = quaternion_from_rotation_vector(angle * axis)
         shift = rotate(turn, start.shift - middle) + middle
-        tried = _Similarity(start.scale, multiply(turn, start.quaternion_xyzw), shift)
+        tried = Similarity(start.scale, multiply(turn, start.quaternion_xyzw), shift)
         of_axes = [rotate(multiply(tried.quaternion_xyzw, turned), each)[:, 2] for each in np.eye(3)]
         if (of_axes[1] + LOOKING_DOWN_WEIGHT * of_axes[2]).mean() > 0:
             continue  # upside down
@@ -636,7 +730,7 @@ class _Bundle:
         return poses.reshape(6 * count, -1), pull.ravel(), own, push.ravel(), mixed
 
 
-def _adjusted(start: _Similarity, bundle: _Bundle) -> _AdjustedMap:
+def _adjusted(start: Similarity, bundle: _Bundle) -> _AdjustedMap:
     """Adjust poses and points (Levenberg-Marquardt, points eliminated), with Cauchy's loss that narrows."""
     found = bundle.found
     count = len(found.key)
@@ -718,6 +812,302 @@ def _bridge_sigma(at_ns: Int64, quaternion_xyzw: Float) -> float:
             errors.append((turned[asked].inv() * there).as_rotvec())
     square = np.square(np.concatenate(errors)).mean()
     return SHARE_OF_DOUBLE_STEP * float(np.sqrt(square))
+
+
+# --- joining maps ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PeopleSeen:
+    """A camera's map, and the joints of people whom it sees at T times that all cameras share."""
+
+    name: str
+    found: PictureMap
+    key_t_ns: Int64  # [K] of the mapped pictures
+    xy: Float  # [T, P, J, 2] x/z and y/z of `JOINED`, NaN where not seen
+
+    def rays(self, t_ns: Int64) -> tuple[Float, Float, Float]:
+        """Return centres [T, 3] about their mean in the map's size, attitudes and unit rays [T, P, J, 3]."""
+        from scipy.interpolate import CubicSpline
+        from scipy.spatial.transform import Rotation, RotationSpline
+
+        key_s, seconds = (self.key_t_ns - t_ns[0]) / 1e9, (t_ns - t_ns[0]) / 1e9
+        about = (self.found.position - self.found.position.mean(axis=0)) / self.found.size
+        turn = RotationSpline(key_s, Rotation.from_quat(self.found.quaternion_xyzw))(seconds).as_matrix()
+        ray = np.insert(self.xy, 2, 1.0, axis=-1)
+        ray = np.einsum("tij,tpkj->tpki", turn, ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+        return CubicSpline(key_s, about)(seconds), turn, ray
+
+
+@dataclass(frozen=True)
+class JoinedMaps:
+    """Maps of C cameras in one upright frame whose place and heading are arbitrary."""
+
+    laid: list[LaidMap]
+    position_sigma_m: Float  # [C] per axis, of each camera's constant error
+    tilt_sigma_rad: float  # that all cameras share
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Similarities of C maps into one frame."""
+
+    turn: Float  # [C, 3, 3]
+    at: Float  # [C, 3] m
+    scale: Float  # [C] m
+
+    def moved(self, step: Float) -> _Placed:
+        """Move the last by steps [7 each]: turns (rad), shifts (ten metres) and logarithms of scales."""
+        each = np.concatenate([np.zeros(7 * len(self.at) - len(step)), step]).reshape(-1, 7)
+        turned = matrix_from_quaternion(quaternion_from_rotation_vector(each[:, :3]))
+        return _Placed(turned @ self.turn, self.at + 10 * each[:, 3:6], self.scale * np.exp(each[:, 6]))
+
+    def is_turned_from(self, other: _Placed) -> bool:
+        """Test if the second of two cameras is turned otherwise beside the first, by `RIVAL_DEG` or more."""
+        apart = self.turn[0].T @ self.turn[1] @ other.turn[1].T @ other.turn[0]
+        return bool(np.trace(apart) < 1 + 2 * np.cos(np.radians(RIVAL_DEG)))
+
+    def misses(self, centre: Float, ray: Float, sigma_rad: Float) -> tuple[Float, Float, Bool]:
+        """Return rays' misses [C, T, J, 3] of their points in standard deviations, points, and where any.
+
+        Centres are [C, T, 3], rays [C, T, J, 3]. A joint that one camera alone sees tells nothing.
+        """
+        ray = np.einsum("cij,ctnj->ctni", self.turn, ray)
+        centre = np.einsum("cij,ctj->cti", self.turn * self.scale[:, None, None], centre) + self.at[:, None]
+        seen = np.isfinite(ray).all(axis=-1)
+        seen = seen & (seen.sum(axis=0) > 1)
+        ray = np.where(seen[..., None], ray, 0.0)
+        across = (np.eye(3) - ray[..., :, None] * ray[..., None, :]) * seen[..., None, None]
+        right = np.einsum("ctnij,ctj->tni", across, centre)
+        point = np.linalg.solve(across.sum(axis=0) + MIN_SQUARED_ANGLE * np.eye(3), right[..., None])[..., 0]
+        away = point - centre[:, :, None]
+        away /= np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), MIN_DEPTH_M)
+        miss = np.where(seen[..., None], away - ray, 0.0) / sigma_rad[:, None, None, None]
+        return np.asarray(miss), np.asarray(point), np.asarray(seen)
+
+
+def _fitted(
+    start: _Placed, centre: Float, ray: Float, sigma_rad: Float, steps: int, turn: Float | None = None
+) -> tuple[_Placed, float, Float]:
+    """Fit similarities to rays of middles by Cauchy's loss; return the cost, and the normal matrix, too.
+
+    With attitudes `turn` [C, T, 3, 3] horizons are level and the person upright in the mean; without, the
+    first camera is held.
+    """
+    from scipy.optimize import least_squares
+
+    def residuals(step: Float) -> Float:
+        placed = start.moved(step)
+        miss, point, seen = placed.misses(centre, ray, sigma_rad)
+        size = np.linalg.norm(miss, axis=-1, keepdims=True) / 3
+        miss = miss * np.sqrt(np.log1p(np.square(size))) / np.maximum(size, 1e-9)
+        if turn is None:
+            return np.asarray(miss.ravel())
+        alike = np.sqrt(INDEPENDENT_MOMENTS / centre.shape[1])
+        level = np.einsum("ci,cti->c", placed.turn[:, 2], turn[..., 0]) / turn.shape[1]
+        person = point.reshape(-1, len(MIDDLES), 3)
+        some: Bool = (seen.sum(axis=0) > 1).reshape(-1, len(MIDDLES))
+        axis, whole = person[:, SHOULDERS] - person[:, ANKLES], some[:, SHOULDERS] & some[:, ANKLES]
+        axis = whole[:, None] * axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
+        lean = (axis.sum(axis=0) / max(whole.sum(), 1) - [0, 0, 1]) / np.radians(UPRIGHT_SIGMA_DEG)
+        return np.concatenate([alike * miss.ravel(), level / np.radians(LEVEL_SIGMA_DEG), lean])
+
+    done = least_squares(residuals, np.zeros(7 * (len(centre) - (turn is None))), max_nfev=steps)
+    slope = np.asarray(done.jac)
+    return start.moved(done.x), float(done.cost), slope.T @ slope
+
+
+def _middles(ray: Float) -> Float:
+    """Return the rays [..., 8, 3] of `MIDDLES` from those of `JOINED` [..., 15, 3]."""
+    sides = ([k for k, name in enumerate(JOINED) if name.endswith(part)] for part in MIDDLES)
+    middle = np.stack([ray[..., each, :].mean(axis=-2) for each in sides], axis=-2)
+    return np.asarray(middle / np.linalg.norm(middle, axis=-1, keepdims=True))
+
+
+def _paired(centre: Float, turn: Float, ray: Float, stature_m: float) -> tuple[_Placed, Float] | None:
+    """Place two cameras by one person, rays [2, T, 8, 3], from several headings; and the sigmas."""
+    from scipy.spatial.transform import Rotation
+
+    both = np.isfinite(ray[..., 0]).all(axis=0)
+    if both.sum() < MIN_COMMON_JOINTS:
+        return None
+    down = np.radians(FIRST_DOWN_DEG)
+    ahead = np.array([0.0, np.cos(down), -np.sin(down)])
+    looking = np.stack([[1.0, 0.0, 0.0], np.cross(ahead, [1.0, 0.0, 0.0]), ahead], axis=1)
+    upright = looking @ np.stack([Rotation.from_matrix(each).mean().as_matrix().T for each in turn])
+    seen = np.einsum("cij,ctkj->ctki", upright, ray)
+    away = away_by_size(seen[:, :, ANKLES], seen[:, :, 0], stature_m)
+    rows = np.isfinite(away).all(axis=(0, 2))
+    if rows.sum() < MIN_MOMENTS:
+        return None
+    away, sigma = away[:, rows], JOINT_SIGMA_M / np.median(np.linalg.norm(away[:, rows], axis=2), axis=1)
+    (useful,) = np.nonzero(both.sum(axis=1) >= MIN_MOMENTS)
+    few, some = (useful[:: max(1, len(useful) // count)] for count in PAIRED_MOMENTS)
+    tried = []
+    for angle in np.arange(FIRST_HEADINGS) * 2 * np.pi / FIRST_HEADINGS:
+        headed = matrix_from_quaternion(quaternion_from_rotation_vector(np.array([0.0, 0.0, angle])))
+        turned, there = np.stack([upright[0], headed @ upright[1]]), np.stack([away[0], away[1] @ headed.T])
+        path = np.einsum("cij,ctj->cti", turned, centre[:, rows])
+        # Scales and shift that bring the person's places together, by least squares.
+        shift = np.broadcast_to(np.eye(3), (rows.sum(), 3, 3))
+        lines = np.concatenate([path[0][..., None], -path[1][..., None], -shift], axis=-1).reshape(-1, 5)
+        scale = np.linalg.lstsq(lines, (there[1] - there[0]).ravel(), rcond=None)[0][:2].clip(*SCALES_M)
+        at = np.median(scale[0] * path[0] + there[0] - scale[1] * path[1] - there[1], axis=0)
+        start = _Placed(turned, np.stack([np.zeros(3), at]), scale)
+        tried.append(_fitted(start, centre[:, few], ray[:, few], sigma, 10)[:2])
+    tried.sort(key=lambda each: each[1])
+    placed, cost, _ = _fitted(tried[0][0], centre[:, some], ray[:, some], sigma, 30)
+    others = (other for other, _ in tried if placed.is_turned_from(other))
+    if (rival := next(others, None)) is not None:
+        rival, higher, _ = _fitted(rival, centre[:, some], ray[:, some], sigma, 30)
+        if higher < MAX_RIVAL_COST * cost and placed.is_turned_from(rival):
+            return None
+    return placed, sigma
+
+
+def _best_pair(
+    centre: Float, turn: Float, rays: Sequence[Float], stature_m: float
+) -> tuple[float, _Placed, Float, dict[int, int]] | None:
+    """Place two cameras by the person, of tracks [T, P, 8, 3] each, with whom most joints agree.
+
+    Return that number, the similarities, sigmas, and tracks of the same people. None for nobody, and where
+    another person would do as well and place the cameras otherwise.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    tried: list[tuple[float, _Placed, Float, dict[int, int]]] = []
+    tracks = list(product(*(range(each.shape[1]) for each in rays)))
+    views = {each: np.stack([rays[c][:, track] for c, track in enumerate(each)]) for each in tracks}
+    for each in tracks:
+        if (found := _paired(centre, turn, views[each], stature_m)) is None:
+            continue
+        gains, common = np.zeros((2, *(own.shape[1] for own in rays)))
+        for other, ray in views.items():
+            miss, _, seen = found[0].misses(centre, ray, found[1])
+            near = np.clip(1 - np.square(miss).sum(axis=-1).max(axis=0) / 9, 0, None)
+            common[other], gains[other] = seen[0].sum(), near[seen[0]].sum()
+        matched = zip(*linear_sum_assignment(-gains), strict=True)
+        same = {int(p): int(q) for p, q in matched if gains[p, q] > MIN_JOINED_SHARE * common[p, q] / 2}
+        tried.append((float(sum(gains[p, q] for p, q in same.items())), *found, same))
+    if not tried:
+        return None
+    best = max(tried, key=lambda each: each[0])
+    rivals = [placed for gain, placed, *_ in tried if gain > MAX_RIVAL_SHARE * best[0]]
+    return None if any(best[1].is_turned_from(other) for other in rivals) else best
+
+
+def join_maps(cameras: Sequence[PeopleSeen], t_ns: Int64, stature_m: float) -> JoinedMaps:
+    """Join maps by the people whom their cameras see at times [T]; NoAttitudesError: they do not.
+
+    Two cameras are placed by a person of the one and a person of the other, from several headings and the
+    person's distances by size. The camera whose joints agree best with the others' holds all together. All
+    similarities are then refined together, and limbs give the scale.
+    """
+    seen = [camera.rays(t_ns) for camera in cameras]
+    centre, turn = (np.stack([each[k] for each in seen]) for k in (0, 1))
+    middles = [_middles(each[2]) for each in seen]
+    count = len(cameras)
+    pairs: dict[int, dict[int, tuple[Any, ...]]] = {c: {} for c in range(count)}
+    for a, b in combinations(range(count), 2):
+        found = _best_pair(centre[[a, b]], turn[[a, b]], [middles[a], middles[b]], stature_m)
+        if found is not None:
+            gain, pair, its, same = found
+            pairs[a][b] = gain, pair, its, [0, 1], same
+            pairs[b][a] = gain, pair, its, [1, 0], {q: p for p, q in same.items()}
+    hub = max(pairs, key=lambda c: (len(pairs[c]), sum(pair[0] for pair in pairs[c].values())))
+    if lone := [camera.name for c, camera in enumerate(cameras) if c != hub and c not in pairs[hub]]:
+        raise NoAttitudesError(
+            f"{', '.join(lone)} and {cameras[hub].name} see nobody at equal times, or nobody who walks about"
+        )
+    sigma, people = np.full(count, np.nan), range(middles[hub].shape[1])
+    chosen = [{p: p for p in people} if c == hub else pairs[hub][c][4] for c in range(count)]
+    start = _Placed(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.ones(count))
+    for c, (_, pair, its, (near, far), _) in pairs[hub].items():
+        # Similarities of the pair, in the frame of the hub's map.
+        start.turn[c] = pair.turn[near].T @ pair.turn[far]
+        start.at[c] = (pair.at[far] - pair.at[near]) @ pair.turn[near] / pair.scale[near]
+        start.scale[c] = pair.scale[far] / pair.scale[near]
+        sigma[[hub, c]], first = its[[near, far]], (pair.turn[near], pair.scale[near])
+    start = _Placed(first[0] @ start.turn, first[1] * start.at @ first[0].T, first[1] * start.scale)
+
+    def of_people(rays: Sequence[Float]) -> Float:
+        """Put the people of all cameras, [T, P, J, 3] each, in the hub's order, [C, T, P J, 3]."""
+        nobody = np.full_like(rays[0][:, 0], np.nan)
+        ordered = [
+            np.concatenate([own[:, same[p]] if p in same else nobody for p in people], axis=1)
+            for own, same in zip(rays, chosen, strict=True)
+        ]
+        return np.stack(ordered)
+
+    ray = of_people(middles)
+    placed, _, normal = _fitted(start, centre, ray, sigma, 60, turn)
+    miss, point, known = placed.misses(centre, ray, sigma)
+    near = known & (np.square(miss).sum(axis=-1) < 9)
+    for camera, mine, all_of in zip(cameras, near, known, strict=True):
+        if all_of.sum() < MIN_COMMON_JOINTS or mine.sum() < MIN_JOINED_SHARE * all_of.sum():
+            raise NoAttitudesError(
+                f"{mine.sum()} of the {all_of.sum()} joints that {camera.name} and others see at equal times"
+                " are at one place: clocks are off, or they film different people"
+            )
+    middle = np.median(point[near.any(axis=0)], axis=0)
+    miss, point, known = placed.misses(centre, of_people([each[2] for each in seen]), sigma)
+    point = np.where((known & (np.square(miss).sum(axis=-1) < 9)).sum(axis=0)[..., None] > 1, point, np.nan)
+    return _laid_together(cameras, placed, normal, middle, _larger_by_limbs(point, stature_m))
+
+
+def _larger_by_limbs(point: Float, stature_m: float) -> float:
+    """Return by how much joints [T, P J, 3] must grow until limbs are those of people of a stature."""
+    known = landmarks_of(["left_mouth", *JOINED])
+    if known is None:
+        raise AssertionError("the joints are landmarks")
+    still = body_model().reach(np.arange(len(BONES)), np.zeros((len(BONES), 3)))[0].sum(axis=1)
+    body = dict(zip(known[0].joints, stature_m * (still[known[0].bone] + known[0].offset), strict=True))
+    # Shanks, thighs and the sides of the trunk bend least with pose and detector.
+    ends = [
+        [JOINED.index(f"{side}_{part}") for part in limb]
+        for limb in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "hip"))
+        for side in ("left", "right")
+    ]
+    wanted = np.array([np.linalg.norm(np.subtract(*(body[JOINED[k]] for k in pair))) for pair in ends])
+    point = point.reshape(-1, len(JOINED), 3)
+    lengths = np.linalg.norm(point[:, ends][:, :, 1] - point[:, ends][:, :, 0], axis=-1)
+    measured = np.isfinite(lengths).any(axis=0)
+    if not measured.any():
+        raise NoAttitudesError("nobody's legs and trunk are seen, which give the scale")
+    return float(wanted[measured].sum() / np.nanmedian(lengths[:, measured], axis=0).sum())
+
+
+def _laid_together(
+    cameras: Sequence[PeopleSeen], placed: _Placed, normal: Float, middle: Float, larger: float
+) -> JoinedMaps:
+    """Return the maps in a frame with people at its origin; errors without what all cameras share."""
+    count, laid = len(cameras), []
+    # Turns, shifts and growth of everything: no picture shows them, and no camera's error holds them.
+    arms = placed.at - placed.at.mean(axis=0)
+    common = np.zeros((count, 7, 7))
+    common[:, :3, :3] = common[:, 3:6, 3:6] = np.eye(3)
+    common[:, 3:6, :3], common[:, 3:6, 6], common[:, 6, 6] = -cross_matrix(arms) / 10, arms / 10, 1.0
+    free = common.reshape(-1, 7)
+    covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+    tilt = covariance.reshape(count, 7, count, 7)[:, :2, :, :2].mean(axis=(0, 2))
+    own = np.eye(7 * count) - free @ np.linalg.pinv(free)
+    variance = np.diagonal(own @ covariance @ own.T).reshape(count, 7)
+    sigmas = np.sqrt(variance[:, :3].mean(axis=1)).tolist()
+    for camera, turn, at, scale, sigma in zip(
+        cameras, placed.turn, placed.at, placed.scale, sigmas, strict=True
+    ):
+        found = camera.found
+        path = scale * (found.position - found.position.mean(axis=0)) / found.size @ turn.T + at - middle
+        turned = continuous_signs(multiply(quaternion_from_matrix(turn), found.quaternion_xyzw))
+        bridged = _bridge_sigma(camera.key_t_ns, turned)
+        laid.append(LaidMap(camera.key_t_ns, larger * path, turned, 0.0, 0.0, sigma, bridged))
+        if np.degrees(sigma) > MAX_ATTITUDE_SIGMA_DEG:
+            raise NoAttitudesError(
+                f"people do not say how {camera.name} lies beside the others (standard deviation"
+                f" {np.degrees(sigma):.0f} deg): let it see them for longer, while they walk about"
+            )
+    position_m = larger * 10 * np.sqrt(variance[:, 3:6].mean(axis=1))
+    return JoinedMaps(laid, position_m, float(np.sqrt(np.trace(tilt) / 2)))
 
 
 # --- poses of all pictures -------------------------------------------------------------------------------

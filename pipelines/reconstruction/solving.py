@@ -183,6 +183,17 @@ def position_sigma_m(errors: PoseErrors | None) -> float:
     return float(np.linalg.norm(lasting))
 
 
+def away_by_size(ankles: Float, nose: Float, stature_m: float) -> Float:
+    """Return how far a person's middle is from the camera [..., 3] m, by upright rays [..., 3]; NaN: behind.
+
+    Ankles and nose are one above the other: distances along both rays by least squares.
+    """
+    lines = np.stack([-ankles, nose], axis=-1)
+    far = np.linalg.pinv(np.nan_to_num(lines)) @ np.array([0.0, 0.0, NOSE_TO_ANKLES * stature_m])
+    middle = (far[..., :1] * ankles + far[..., 1:] * nose) / 2
+    return np.where((far > 0).all(axis=-1, keepdims=True), middle, np.nan)
+
+
 def placed_by_size(
     joints: Sequence[str], found: Candidates, stated_m: Sequence[float], hips: Float | None, stature_m: float
 ) -> Float:
@@ -200,11 +211,7 @@ def placed_by_size(
     left, right, nose = (rays[:, :, joints.index(name)] for name in ("left_ankle", "right_ankle", "nose"))
     ends = np.insert(np.stack([(left + right) / 2, nose], axis=2), 2, 1.0, axis=-1)
     ends = np.einsum("tcij,tckj->tcki", found.rotation, ends)
-    # Ankles and nose are one above the other: distances along both rays by least squares.
-    lines = np.stack([-ends[:, :, 0], ends[:, :, 1]], axis=-1)
-    far = np.linalg.pinv(np.nan_to_num(lines)) @ np.array([0.0, 0.0, NOSE_TO_ANKLES * stature_m])
-    away = (far[..., None] * ends).mean(axis=2)
-    away[(far <= 0).any(axis=2)] = np.nan
+    away = away_by_size(ends[:, :, 0], ends[:, :, 1], stature_m)
     places = found.position + away
     if hips is not None:
         places = np.concatenate([places, hips[:, None]], axis=1)

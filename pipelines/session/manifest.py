@@ -405,14 +405,26 @@ class PoseSource(PlacedSource, MeasuredSource, FileSource):
     """Source of a camera's poses: a trajectory, a log, a drone's own log or a calibration."""
 
     part = "pose"
+    needs_file = False
     of: Literal["camera", "body"] | None = None
     """Object of the poses: the camera, or the body that carries it by a mount or gimbal."""
     attitude: str | None = None
     """Topic of attitudes, for a topic of positions; or `pictures`: the camera's film shows how it turned."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_no_file(cls, value: object) -> object:
+        return {"attitude": PICTURES} if value in (PICTURES, {"file": PICTURES}) else value
+
+    @model_validator(mode="after")
+    def _complete(self) -> PoseSource:
+        if not self.file and not (self.by_pictures and self.model_fields_set == {"attitude"}):
+            raise ValueError("file: is missing; `pose: pictures` alone says that no log has any place")
+        return self
+
     @property
     def by_pictures(self) -> bool:
-        """True if the attitudes are found by the camera's film."""
+        """True if the attitudes are found by the camera's film; without a file, the places, too."""
         return self.attitude == PICTURES
 
 
@@ -526,7 +538,8 @@ class CameraSources(YamlModel):
     """Clock of the pictures, relative to the world's."""
     pose: PoseSource = Field(
         examples=[
-            "pose: drone1.tum, {file: drone1.mcap, topic: /odometry, of: body}, or a calibration with poses"
+            "pose: drone1.tum, {file: drone1.mcap, topic: /odometry, of: body}, a calibration with poses, or"
+            " `pictures` for two or more cameras that move and have no log at all"
         ]
     )
     """Poses of the camera."""
@@ -558,6 +571,14 @@ class CameraSources(YamlModel):
             raise ValueError("pose.attitude: pictures gives the camera's own: leave mount and gimbal out")
         if self.pose.by_pictures and self.video is None:
             raise ValueError("pose.attitude: pictures needs a video")
+        if not self.pose.file:
+            if self.frame_times is None or not self.frame_times.is_placed:
+                raise ValueError(
+                    "pose: pictures needs the time of the first picture, frame_times: {start: container} or"
+                    " {start: SECONDS}: cameras are joined by people at equal times"
+                )
+            if self.pose_noise:
+                raise ValueError("pose: pictures finds its own errors: leave pose_noise out")
         return self
 
     @property
@@ -659,6 +680,15 @@ class Manifest(YamlModel):
             raise ValueError("actor and actors: leave one of them out")
         if self.logged_people and not any(actor.weight for actor in self.logged_people.values()):
             raise ValueError("weight: somebody must have one above 0")
+        lone = [name for name, camera in self.cameras.items() if not camera.pose.file]
+        if lone and (len(lone) == 1 or len(lone) < len(self.cameras)):
+            raise ValueError(
+                f"cameras.{lone[0]}.pose: pictures joins two or more cameras, and all of a flight: name a log"
+                " of its places, {file: LOG, attitude: pictures}"
+            )
+        placed = [key for key in ("actor", "actors", "map", "truth", "plan") if getattr(self, key)]
+        if lone and placed:
+            raise ValueError(f"{placed[0]}: `pose: pictures` has a frame of its own: leave it out")
         named = [("clock_reference", self.clock_reference)] if self.clock_reference else []
         named += [("truth.poses", name) for name in (self.truth.poses if self.truth else ())]
         named += [("plan", name) for name in self.plan]

@@ -55,8 +55,6 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
         raise DataError(path, f"{name} is no format of a {noun}", "leave `format:` out", code="wrong-kind")
     if not (path.exists() or is_folder(path)):
         remedy = "check the path; paths are relative to the file that names them"
-        if path.name == "pictures":
-            remedy = "films alone give no place: log it, and write {file: track.gpx, attitude: pictures}"
         raise DataError(path, "does not exist", remedy, code="no-such-file")
     refuse_special(path)
     refuse_pointers(path)

@@ -1,5 +1,8 @@
 """Poses of a camera whose log has places alone: its film says how it turned (`pose.attitude: pictures`)."""
 
+from __future__ import annotations
+
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
@@ -9,7 +12,8 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from pipelines.geometry.arrays import Index, Intrinsics
+from pipelines.geometry.arrays import Float, Index, Int64, Intrinsics
+from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import PoseErrors, pose_errors
 from pipelines.geometry.poses import (
     conjugate,
@@ -17,15 +21,24 @@ from pipelines.geometry.poses import (
     multiply,
     rotation_vector_from_quaternion,
 )
+from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.reconstruction.background_tracks import Follower
+from pipelines.reconstruction.one_camera import STATED_STATURE_SIGMA_M, STATURE_M
 from pipelines.reconstruction.picture_map import (
+    JOINED,
+    LIMB_SIGMA_SHARE,
+    MAX_FAR_SHARE,
+    MOST_TRACKS,
     REVISION,
     KeyFeatures,
     LaidMap,
     NoAttitudesError,
+    PeopleSeen,
     PictureMap,
+    far_share,
     features_of,
     followed_features,
+    join_maps,
     key_rows,
     lay_on_places,
     map_pictures,
@@ -37,7 +50,8 @@ from pipelines.session.camera_poses import noise_models
 from pipelines.session.description import PictureMapEntry
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress
-from pipelines.session.records import Trajectory
+from pipelines.session.records import Detections, Trajectory
+from pipelines.session.registries import find_detector
 from pipelines.session.storage import hash_of
 from pipelines.session.tables import read_table, write_table
 from pipelines.sources.parts import CameraFrames
@@ -68,6 +82,16 @@ MAX_COMPARED_GAP_S = 20.0
 # Positions of a log on board that state no errors are taken to have the constant ones of `UNKNOWN_SIGMA`.
 UNSTATED_BIAS_M = 0.3
 
+# People are looked for so often, which the tracker can follow, in so much of the middle of a flight.
+JOINED_STEP_NS, JOINED_S = 166_666_667, 40.0
+# In less time people do not move, and their errors are one.
+MIN_JOINED_S = 2.0
+# A joint of less confidence is a guess.
+MIN_JOINED_CONFIDENCE = 0.5
+# Places of a right map err by this against each other (13 rendered cameras: 3 to 32 mm).
+MAPPED_SIGMA_M = 0.02
+JOINING_DETECTOR = "blazepose"
+
 
 @dataclass(frozen=True)
 class TurnedByPictures:
@@ -86,6 +110,68 @@ class FilmOfCamera:
 
     digest: str
     opened: Callable[[], AbstractContextManager[CameraPictures]]
+
+
+@dataclass(frozen=True)
+class UnposedCamera:
+    """A camera with its film, and what is known of it beside poses."""
+
+    film: FilmOfCamera
+    frames: CameraFrames
+    intrinsics: Intrinsics
+    detections: Detections | None  # keypoints that are stated
+    refine_focal: bool
+    kept: Callable[[str], PictureMap | None]  # the map of an earlier ingest by its key
+
+    @property
+    def key_t_ns(self) -> Int64:
+        """Times of the key pictures."""
+        return self.frames.t_ns[key_rows(self.frames.pts_ns)]
+
+    def mapped(self, progress: Progress) -> tuple[str, PictureMap]:
+        """Map the key pictures, or return the kept map, with its key; errors as in `map_pictures`."""
+        rows = key_rows(self.frames.pts_ns)
+        numbers = self.frames.frame[rows].tolist()
+        key = hash_of([REVISION, self.film.digest, numbers, asdict(self.intrinsics), self.refine_focal])
+        found = self.kept(key)
+        if found is None:
+            features = _features(self.film, self.frames, rows, self.intrinsics, progress)
+            found = map_pictures(features, self.intrinsics, refine_focal=self.refine_focal)
+        return key, found
+
+    def people(self, t_ns: Int64, found: PictureMap, progress: Progress) -> Float:
+        """Return x/z and y/z [T, P, J, 2] of people's `JOINED` in the pictures next to some times [T]."""
+        after = np.searchsorted(self.frames.t_ns, t_ns).clip(1, len(self.frames.t_ns) - 1)
+        late = self.frames.t_ns[after] - t_ns > t_ns - self.frames.t_ns[after - 1]
+        numbers = self.frames.frame[after - late].tolist()
+        rows: list[tuple[int, int, Float, Float]] = []
+        if self.detections is not None:
+            joints, these = self.detections.joints, self.detections
+            for k, number in enumerate(numbers):
+                own = np.flatnonzero(these.frame == number).tolist()
+                rows += [(k, int(these.person[row]), these.xy[row], these.confidence[row]) for row in own]
+        else:
+            networks = find_detector(JOINING_DETECTOR).load(threads=1)
+            joints, tracker = networks.joints, PeopleTracker(networks)
+            progress.start("Finding people to join cameras by", len(numbers))
+            with self.film.opened() as pictures:
+                for k, number in enumerate(numbers):
+                    picture = pictures.read(number)
+                    found_here = [] if picture is None else tracker.step(picture)
+                    rows += [(k, who.track, who.person.xy, who.person.confidence) for who in found_here]
+                    progress.advance()
+        if lacking := [name for name in JOINED if name not in joints]:
+            raise NoAttitudesError(f"its keypoints have no {lacking[0]}")
+        columns, ratio = [joints.index(name) for name in JOINED], found.focal_ratio
+        lens = replace(self.intrinsics, fx=ratio * self.intrinsics.fx, fy=ratio * self.intrinsics.fy)
+        often = Counter(person for _, person, _, _ in rows).most_common(MOST_TRACKS)
+        seen = np.full((len(t_ns), max(len(often), 1), len(JOINED), 2), np.nan)
+        order = {person: number for number, (person, _) in enumerate(often)}
+        for k, person, xy, confidence in rows:
+            if person in order:
+                sure = confidence[columns] > MIN_JOINED_CONFIDENCE
+                seen[k, order[person]] = np.where(sure[:, None], xy[columns], np.nan)
+        return undistort(seen.reshape(-1, 2), lens).reshape(seen.shape)
 
 
 def turned_by_pictures(
@@ -110,17 +196,13 @@ def turned_by_pictures(
     of an earlier ingest by its key; `note` receives one line on the result.
     """
     rows = key_rows(frames.pts_ns)
-    numbers = frames.frame[rows].tolist()
-    key = hash_of([REVISION, film.digest, numbers, asdict(intrinsics), refine_focal])
     stated = None if not pose_noise else {model: dict(values) for model, values in pose_noise.items()}
     if stated is None and satellite_sigma_m is not None:
         stated = {"gauss-markov": {"position_m": satellite_sigma_m, "correlation_s": SATELLITE_CORRELATION_S}}
         note(f"{name}: its places are taken to be off by {satellite_sigma_m:g} m: say pose_noise if not")
     try:
-        found = kept(key)
-        if found is None:
-            features = _features(film, frames, rows, intrinsics, progress)
-            found = map_pictures(features, intrinsics, refine_focal=refine_focal)
+        camera = UnposedCamera(film, frames, intrinsics, None, refine_focal, kept)
+        key, found = camera.mapped(progress)
         laid = lay_on_places(
             found, intrinsics, frames.t_ns[rows], places.t_ns, places.position, _errors(place, stated)
         )
@@ -128,45 +210,120 @@ def turned_by_pictures(
         problem = f"its film does not say how it turned: {error}"
         remedy = "name a log with attitudes, or gimbal: {yaw_deg: 90, pitch_deg: -30} if it never turned"
         raise DataError(f"{place}.pose.attitude", problem, remedy, code="no-attitude") from None
-    position, turned = poses_of_pictures(laid, places.t_ns, places.position, frames.t_ns)
-    known = np.isfinite(turned[:, 0])
     common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
     unlike = _unlike_log(name, laid, places, note)
+    note(
+        f"{name}: attitudes by its pictures, {len(found.key)} of {len(rows)} mapped,"
+        f" {laid.residual_m:.2g} m from its places; standard deviation {common_deg:.2g} deg of all,"
+        f" {picture_deg:.2g} deg of each"
+    )
+    turned = _of_laid(camera, name, key, found, laid, places, _with_rotation(stated, laid), note)
+    return replace(turned, entry=turned.entry.model_copy(update={"unlike_log": unlike}))
+
+
+def _of_laid(
+    camera: UnposedCamera,
+    name: str,
+    key: str,
+    found: PictureMap,
+    laid: LaidMap,
+    places: Trajectory,
+    pose_noise: dict[str, dict[str, float | str]],
+    note: Callable[[str], None],
+) -> TurnedByPictures:
+    """Return the poses of all pictures of a laid map beside some places, and what is said of it."""
+    intrinsics, ratio = camera.intrinsics, found.focal_ratio
+    if camera.refine_focal:
+        note(
+            f"{name}: its focal length of {intrinsics.fx:.0f} px is assumed, and"
+            + (
+                " its pictures do not determine it: it is held"
+                if ratio == 1.0
+                else f" {ratio * intrinsics.fx:.0f} px by its pictures"
+            )
+        )
+    t_ns = camera.frames.t_ns
+    position, turned = poses_of_pictures(laid, places.t_ns, places.position, t_ns)
+    known = np.isfinite(turned[:, 0])
+    common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
     entry = PictureMapEntry(
         key=key,
-        unlike_log=unlike,
-        key_pictures=len(numbers),
+        key_pictures=len(key_rows(camera.frames.pts_ns)),
         mapped=len(found.key),
         points=int(found.seen_point.max()) + 1,
         error_px=laid.error_px,
         residual_m=laid.residual_m,
         common_sigma_deg=common_deg,
         picture_sigma_deg=picture_deg,
-        focal_ratio=found.focal_ratio,
+        focal_ratio=ratio,
     )
-    note(
-        f"{name}: attitudes by its pictures, {len(found.key)} of {len(numbers)} mapped,"
-        f" {laid.residual_m:.2g} m from its places; standard deviation {common_deg:.2g} deg of all,"
-        f" {picture_deg:.2g} deg of each"
-    )
-    if refine_focal:
-        held = found.focal_ratio == 1.0
-        note(
-            f"{name}: its focal length of {intrinsics.fx:.0f} px is assumed, and"
-            + (
-                " its pictures do not determine it: it is held"
-                if held
-                else f" {found.focal_ratio * intrinsics.fx:.0f} px by its pictures"
-            )
-        )
-    ratio = found.focal_ratio
     return TurnedByPictures(
-        replace(places, t_ns=frames.t_ns[known], position=position[known], quaternion_xyzw=turned[known]),
+        replace(places, t_ns=t_ns[known], position=position[known], quaternion_xyzw=turned[known]),
         replace(intrinsics, fx=ratio * intrinsics.fx, fy=ratio * intrinsics.fy),
-        _with_rotation(stated, laid),
+        pose_noise,
         found,
         entry,
     )
+
+
+def posed_by_people(
+    place: str,
+    cameras: Mapping[str, UnposedCamera],
+    stature_m: float | None,
+    note: Callable[[str], None],
+    progress: Progress,
+) -> dict[str, TurnedByPictures]:
+    """Find the poses of cameras by their films and the people in them; DataError: they do not say them.
+
+    Each camera is mapped by itself. Six times a second of at most `JOINED_S`, people are looked for where no
+    keypoints are stated. The frame is upright and begins at the people; one line says how far it is known.
+    """
+    maps: dict[str, tuple[str, PictureMap]] = {}
+    for name, camera in cameras.items():
+        try:
+            maps[name] = camera.mapped(progress)
+            if (far := far_share(maps[name][1], camera.intrinsics)) > MAX_FAR_SHARE:
+                raise NoAttitudesError(f"its map contradicts {100 * far:.0f} % of the points that are seen")
+        except NoAttitudesError as error:
+            problem = f"its film does not say how it moved: {error}"
+            remedy = "leave it out, name a log of its poses or places, or film while it flies about"
+            raise DataError(f"{place}.{name}.pose", problem, remedy, code="no-poses") from None
+    keys = {name: cameras[name].key_t_ns[found.key] for name, (_, found) in maps.items()}
+    first, last = max(int(t_ns[0]) for t_ns in keys.values()), min(int(t_ns[-1]) for t_ns in keys.values())
+    spare = max(last - first - round(JOINED_S * 1e9), 0) // 2
+    t_ns = np.arange(first + spare, last - spare + 1, JOINED_STEP_NS, dtype=np.int64)
+    stature, sigma_m = STATURE_M if stature_m is None else (stature_m, STATED_STATURE_SIGMA_M)
+    try:
+        if len(t_ns) * JOINED_STEP_NS < MIN_JOINED_S * 1e9:
+            raise NoAttitudesError(f"their films share {max(last - first, 0) / 1e9:.1f} s")
+        seen = [
+            PeopleSeen(name, maps[name][1], keys[name], camera.people(t_ns, maps[name][1], progress))
+            for name, camera in cameras.items()
+        ]
+        joined = join_maps(seen, t_ns, stature)
+    except NoAttitudesError as error:
+        problem = f"pose: pictures: people do not join the cameras: {error}"
+        remedy = "check frame_times.start, film the same people for longer, or name logs of places"
+        raise DataError(place, problem, remedy, code="no-poses") from None
+    scale = float(np.hypot(LIMB_SIGMA_SHARE, sigma_m / stature))
+    note(
+        f"poses by pictures and people: place and heading on Earth are arbitrary, lengths are those of people"
+        f" of {stature:.2f} m, to {100 * scale:.0f} %, and the vertical is off by"
+        f" {np.degrees(joined.tilt_sigma_rad):.1f} deg (standard deviations)"
+    )
+    turned = {}
+    for (name, camera), laid, sigma in zip(
+        cameras.items(), joined.laid, joined.position_sigma_m.tolist(), strict=True
+    ):
+        common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
+        note(f"{name}: beside the other cameras to {sigma:.2g} m and {common_deg:.2g} deg")
+        noise: dict[str, dict[str, float | str]] = {
+            "bias": {"position_m": round(sigma, 4), "rotation_deg": round(common_deg, 4)},
+            "white": {"position_m": MAPPED_SIGMA_M, "rotation_deg": round(picture_deg, 4)},
+        }
+        places = Trajectory(laid.t_ns, laid.position, laid.quaternion_xyzw)
+        turned[name] = _of_laid(camera, name, *maps[name], laid, places, noise, note)
+    return turned
 
 
 def _unlike_log(name: str, laid: LaidMap, logged: Trajectory, note: Callable[[str], None]) -> int:

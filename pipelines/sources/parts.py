@@ -24,7 +24,7 @@ from pipelines.session.description import (
     PosesEntry,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, CameraSources
+from pipelines.session.manifest import PICTURES, Axes, CameraSources
 from pipelines.session.records import Detections, Trajectory
 from pipelines.session.tables import (
     FRAMES,
@@ -180,7 +180,7 @@ def _poses_entry(
             rate = f"; is cameras.{name}.frame_times.fps: {float(fps):g} right?" if fps else ""
             note(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses{rate}")
     return PosesEntry(
-        source=pose.file,
+        source=pose.file or PICTURES,
         static=static,
         count=len(trajectory.t_ns),
         rate_hz=_rate(trajectory.t_ns),

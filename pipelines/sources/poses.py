@@ -196,7 +196,8 @@ class FlightPoses:
 
     def is_still(self, camera: CameraSources) -> bool:
         """Return True for a camera that stands still, whose pose is in a calibration."""
-        return isinstance(self._files.format_of("pose", camera.pose), CalibrationFormat)
+        pose = camera.pose
+        return bool(pose.file) and isinstance(self._files.format_of("pose", pose), CalibrationFormat)
 
     def _is_log(self, pose: PoseSource) -> bool:
         return self._files.is_log("pose", pose)
@@ -208,7 +209,7 @@ class FlightPoses:
         """Return True if position and attitude come separately: a drone's own log, or several topics."""
         if self._is_log(pose):
             return pose.attitude is not None and self._logged(pose).parent is None
-        return isinstance(self._files.format_of("pose", pose), TelemetryFormat)
+        return bool(pose.file) and isinstance(self._files.format_of("pose", pose), TelemetryFormat)
 
     def refuse_unfit(self) -> None:
         """Refuse, with a DataError, poses, mounts and gimbals that do not go together."""
@@ -219,6 +220,8 @@ class FlightPoses:
 
     def _unfit_pose(self, camera: CameraSources) -> Iterator[tuple[str, str]]:
         pose, is_log = camera.pose, self._is_log(camera.pose)
+        if not pose.file:
+            return
         title = self._files.format_of("pose", pose).title
         if pose.attitude and not is_log and (self.is_still(camera) or not pose.by_pictures):
             yield f"pose: attitude: no option of this file ({title})", "leave it out"

@@ -139,7 +139,7 @@ USUAL_MISTAKES: list[tuple[str, Any, str, list[str]]] = [
     ("drone1.pose", {"file": "drone1.tum", "topic": "/odom"}, "wrong-option", ["topic", "log"]),
     ("drone1.pose", {"file": "drone1.tum", "of": "body"}, "bad-value", ["`mount`", "`gimbal`"]),
     ("drone1.pose", {"file": "empty.tum"}, "no-poses", ["empty.tum", "no rows"]),
-    ("drone1.pose", "pictures", "no-such-file", ["attitude: pictures"]),
+    ("drone1.pose", "pictures", "bad-value", ["needs a video"]),
     ("drone1.pose.attitude", "pictures", "bad-value", ["needs a video"]),
     ("drone1.pose", None, "bad-value", ["cameras.drone1.pose: ", "of: body"]),
     ("drone1.intrinsics", None, "bad-value", ["cameras.drone1.intrinsics: ", "fx: 1400"]),

@@ -1,31 +1,38 @@
 """Attitudes by pictures, on features and places with known truth."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.body_model import body_model
 from pipelines.geometry.cameras import project
 from pipelines.geometry.noise import PoseErrors, White, pose_errors
 from pipelines.geometry.poses import (
     conjugate,
     invert,
     look_at,
+    matrix_from_quaternion,
     multiply,
     quaternion_from_rotation_vector,
     rotate,
     rotation_vector_from_quaternion,
     transform,
 )
+from pipelines.geometry.rig import BONES
 from pipelines.reconstruction.background_tracks import Tracks
+from pipelines.reconstruction.body_fit import landmarks_of
 from pipelines.reconstruction.picture_map import (
+    JOINED,
     KeyFeatures,
     LaidMap,
     NoAttitudesError,
+    PeopleSeen,
     PictureMap,
+    first_similarity,
     followed_features,
+    join_maps,
     lay_on_places,
     map_pictures,
     poses_of_pictures,
@@ -35,7 +42,6 @@ LENS = Intrinsics(1280, 720, 1000.0, 1000.0, 639.5, 359.5)
 STEP_NS = 200_000_000
 KEYS = 24
 T_NS: Int64 = np.arange(KEYS, dtype=np.int64) * STEP_NS
-NAMELESS: Int64 = np.empty(0, np.int64)
 CENTIMETRE = pose_errors([White(position_m=0.01)])
 
 
@@ -73,9 +79,9 @@ def mapped(places: Float, turned: Float) -> PictureMap:
     return PictureMap(np.arange(len(places)), position, multiply(turn, turned), *sightings)
 
 
-def laid_on(found: PictureMap, places: Float, errors: PoseErrors | None, *, keys_ns: Int64 = T_NS) -> LaidMap:
+def laid_on(found: PictureMap, places: Float, errors: PoseErrors | None) -> LaidMap:
     """Lay a map on a place at each key picture."""
-    return lay_on_places(found, LENS, keys_ns, T_NS, places, errors)
+    return lay_on_places(found, LENS, T_NS, T_NS, places, errors)
 
 
 def errors_deg(laid: LaidMap, turned: Float) -> Float:
@@ -83,28 +89,22 @@ def errors_deg(laid: LaidMap, turned: Float) -> Float:
     return np.degrees(rotation_vector_from_quaternion(multiply(laid.quaternion_xyzw, conjugate(turned))))
 
 
-def seen_points(places: Float, turned: Float, height_m: float) -> Iterator[tuple[Int64, Float]]:
-    """Yield for each picture which of 300 points up to a height it sees, and where, with errors of 0.3 px."""
-    rng = np.random.default_rng(7)
+def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m: float) -> list[KeyFeatures]:
+    """Return 300 points up to a height as they are followed, off by 0.3 px; `lens` is what is known of it."""
+    rng, point, xy = np.random.default_rng(7), [], []
     world = rng.uniform([-6, -6, 0], [6, 6, height_m], (300, 3))
     for pose in zip(places, turned, strict=True):
         pixels = project(transform(invert(*pose), world), LENS)
-        seen = np.flatnonzero(((pixels > 0) & (pixels < [1279, 719])).all(axis=1) & (rng.random(300) < 0.7))
-        yield seen, pixels[seen] + rng.normal(0, 0.3, (len(seen), 2))
+        inside = ((pixels > 0) & (pixels < [1279, 719])).all(axis=1)
+        point.append(np.flatnonzero(inside & (rng.random(300) < 0.7)))
+        xy.append(pixels[point[-1]] + rng.normal(0, 0.3, (len(point[-1]), 2)))
+    picture, rows = np.repeat(np.arange(KEYS), [len(each) for each in point]), np.arange(KEYS)
+    tracks = Tracks(picture, np.concatenate(point), np.concatenate(xy))
+    return followed_features(tracks, rows, rows, lens, T_NS)
 
 
-def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m: float) -> list[KeyFeatures]:
-    """Return features of these points; `lens` is what is known of it."""
-    rng, features = np.random.default_rng(8), []
-    descriptors = rng.gamma(0.5, 40, (300, 128))
-    for seen, pixels in seen_points(places, turned, height_m):
-        noisy = (descriptors[seen] + rng.normal(0, 4, (len(seen), 128))).clip(0, 255).astype(np.uint8)
-        features.append(KeyFeatures((pixels - [lens.cx, lens.cy]) / lens.fx, noisy, NAMELESS))
-    return features
-
-
-def test_features_of_points_give_the_map() -> None:
-    """Features are exact to 0.3 px: attitudes relative to each other come out to 0.05 deg."""
+def test_followed_points_give_the_map() -> None:
+    """Points are exact to 0.3 px: attitudes relative to each other come out to 0.05 deg."""
     places, turned = flown()
     features = features_of_points(places, turned, LENS, 5.0)
     found = map_pictures(features, LENS)
@@ -112,26 +112,11 @@ def test_features_of_points_give_the_map() -> None:
     laid = laid_on(found, places, CENTIMETRE)
     assert np.abs(errors_deg(laid, turned)).max() < 0.1
     assert np.linalg.norm(laid.position - places, axis=1).max() < 0.02
-
-    again = map_pictures(features, LENS)
-    assert (again.quaternion_xyzw == found.quaternion_xyzw).all()
-
-    with pytest.raises(NoAttitudesError):  # a camera that stands sees everything at the same place
-        map_pictures([features[0]] * 12, LENS)
-    with pytest.raises(NoAttitudesError):  # pictures without texture
-        map_pictures([KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8), NAMELESS)] * 12, LENS)
-
-
-def test_followed_points_give_the_map() -> None:
-    """Points are exact to 0.3 px."""
-    places, turned = flown()
-    point, xy = zip(*seen_points(places, turned, 5.0), strict=True)
-    picture, rows = np.repeat(np.arange(KEYS), [len(each) for each in point]), np.arange(KEYS)
-    tracks = Tracks(picture, np.concatenate(point), np.concatenate(xy))
-    found = map_pictures(followed_features(tracks, rows, rows, LENS, T_NS), LENS)
-    laid = laid_on(found, places, CENTIMETRE)
-    assert found.key.tolist() == rows.tolist()
-    assert np.abs(errors_deg(laid, turned)).max() < 0.1
+    assert (map_pictures(features, LENS).quaternion_xyzw == found.quaternion_xyzw).all()
+    nothing = KeyFeatures(np.empty((0, 2)), np.empty((0, 128), np.uint8), np.empty(0, np.int64))
+    for same in (features[0], nothing):  # a camera that stands, and pictures without texture
+        with pytest.raises(NoAttitudesError):
+            map_pictures([same] * 12, LENS)
 
 
 def test_a_guessed_focal_length_is_refined_where_pictures_determine_it() -> None:
@@ -161,14 +146,6 @@ def test_attitudes_are_off_by_what_is_said_of_them() -> None:
     assert 0.6 < np.mean(ratios) < 1.6
 
 
-def test_a_place_that_jumps_away_is_left_out() -> None:
-    places, turned = flown()
-    jumped = places + np.random.default_rng(1).normal(0, 0.01, places.shape)
-    jumped[5] += [30.0, -20.0, 4.0]
-    laid = laid_on(mapped(places, turned), jumped, CENTIMETRE)
-    assert np.abs(errors_deg(laid, turned)).max() < 0.3
-
-
 def test_the_horizon_levels_a_straight_flight_along_the_view() -> None:
     """Places on a line do not say how the map turns about it; pictures without roll do, to 2 deg."""
     places, turned = flown(along_view=True)
@@ -177,13 +154,15 @@ def test_the_horizon_levels_a_straight_flight_along_the_view() -> None:
     assert 1.0 < np.degrees(laid.common_sigma_rad) < 2.0
 
 
-def test_a_bent_map_is_straightened_by_the_places() -> None:
+def test_a_bent_map_is_straightened_by_the_places_but_not_by_one_that_jumped_away() -> None:
     places, turned = flown()
     found = mapped(places, turned)
+    jumped = places + np.random.default_rng(1).normal(0, 0.01, places.shape)
+    jumped[5] += [30.0, -20.0, 4.0]
+    assert np.abs(errors_deg(laid_on(found, jumped, CENTIMETRE), turned)).max() < 0.3
     middle = found.position - found.position.mean(axis=0)
     bent = replace(found, position=found.position + 0.2 * found.size * np.sin(3 * middle / found.size))
-    laid = laid_on(bent, places, CENTIMETRE)
-    assert np.abs(errors_deg(laid, turned)).max() < 0.1
+    assert np.abs(errors_deg(laid_on(bent, places, CENTIMETRE), turned)).max() < 0.1
 
 
 @pytest.mark.parametrize(
@@ -208,21 +187,43 @@ def test_places_that_do_not_say_how_the_map_lies_are_refused(what: str) -> None:
 
 def test_pictures_between_keys_get_poses_but_not_across_a_gap() -> None:
     places, turned = flown()
-    whole = mapped(places, turned)
     kept = np.r_[0:8, 16:KEYS]  # a gap of 1.8 s
-    seen = np.isin(whole.seen_in, kept)
-    found = replace(
-        whole,
-        key=kept,
-        position=whole.position[kept],
-        quaternion_xyzw=whole.quaternion_xyzw[kept],
-        seen_in=np.searchsorted(kept, whole.seen_in[seen]),
-        seen_point=whole.seen_point[seen],
-        seen_xy=whole.seen_xy[seen],
-    )
+    found = replace(mapped(places[kept], turned[kept]), key=kept)
     laid = laid_on(found, places, None)
     at_ns = np.arange(0, int(T_NS[-1]) + 1, STEP_NS // 4)
     position, quaternion = poses_of_pictures(laid, T_NS[2:], places[2:], at_ns)  # places begin late
     known = np.isfinite(quaternion[:, 0])
     assert (known == ((at_ns <= T_NS[7]) | (at_ns >= T_NS[16]))).all()
     assert np.isfinite(position[known]).all()
+
+
+def seen_walking(angle: float, along: Float) -> tuple[PeopleSeen, tuple[Float, Float]]:
+    """Film a body of 1.80 m, arms out, that is at some places [K, 3] m; return the camera's poses, too."""
+    places, turned = flown()
+    about = quaternion_from_rotation_vector(np.array([0.0, 0.0, angle]))
+    pose = rotate(about, places), multiply(about, turned)
+    marks = landmarks_of(["left_mouth", *JOINED]) or pytest.fail("the joints are landmarks")
+    still = body_model().reach(np.arange(len(BONES)), np.zeros((len(BONES), 3)))[0].sum(axis=1)
+    body = dict(zip(marks[0].joints, 1.8 * (still[marks[0].bone] + marks[0].offset), strict=True))
+    joints = along[:, None] + [body[name] for name in JOINED]
+    seen = np.stack([transform(invert(*each), at) for *each, at in zip(*pose, joints, strict=True)])
+    return PeopleSeen(f"{angle}", mapped(*pose), T_NS, (seen[..., :2] / seen[..., 2:])[:, None]), pose
+
+
+def test_cameras_are_joined_by_a_person_whom_they_see() -> None:
+    """Rays are exact: attitudes beside each other, too, and lengths are those of the body."""
+    along = np.stack([np.linspace(-2, 2, KEYS), np.sin(np.linspace(0, 3, KEYS)), np.full(KEYS, 1.0)], axis=1)
+    cameras, poses = zip(*(seen_walking(angle, along) for angle in (0.0, 1.5, 3.4)), strict=True)
+    joined = join_maps(cameras, T_NS, 1.8)
+    true = np.concatenate([places for places, _ in poses])
+    to_true = first_similarity(np.concatenate([laid.position for laid in joined.laid]), true)[0]
+    assert to_true.scale == pytest.approx(1, abs=0.002)
+    upright = matrix_from_quaternion(to_true.quaternion_xyzw)[2, 2]
+    assert np.degrees(np.arccos(upright)) < 2 * np.degrees(joined.tilt_sigma_rad)
+    for laid, (_, turned) in zip(joined.laid, poses, strict=True):
+        now = replace(laid, quaternion_xyzw=multiply(to_true.quaternion_xyzw, laid.quaternion_xyzw))
+        assert np.abs(errors_deg(now, turned)).max() < 0.05
+    other = seen_walking(3.4, np.random.default_rng(4).permutation(along))[0]  # or another clock
+    for third in (other, replace(cameras[2], xy=np.full_like(cameras[2].xy, np.nan))):
+        with pytest.raises(NoAttitudesError):
+            join_maps([*cameras[:2], third], T_NS, 1.8)
