@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -242,6 +243,7 @@ def read_subtitles(path: Path) -> Subtitles:
     return subtitles
 
 
+@lru_cache(maxsize=2)  # places, angles and times of pictures are read from one file
 def parse_subtitles(text: str) -> Subtitles:
     """Parse subtitles; those without display times are shown from their clock times on, the first at 0."""
     blocks = list(_BLOCK.finditer(text))
@@ -283,16 +285,16 @@ _ANGLES = {
 }
 _ABOVE_TAKE_OFF = re.compile(rf"(?:\bBAROMETER\s*:\s*|\bHb\s*:\s*|\bH\s+){_NUMBER}")
 
-_NAMES = {"longtitude": "longitude"} | {
-    f"{old}{angle}": f"{new}_{angle}"
-    for old, new in (("gimbal_", "gb"), ("gb_", "gb"), ("drone_", "drone"), ("uav_", "drone"))
-    for angle in ("yaw", "pitch", "roll")
-}
 _COLUMNS = (
     *("latitude", "longitude", "relative", "absolute", "altitude"),
     *("gb_yaw", "gb_pitch", "gb_roll", "drone_yaw", "drone_pitch", "drone_roll"),
 )
-_HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute"}
+_NAMES = {name: name for name in _COLUMNS}
+_NAMES |= {"longtitude": "longitude", "rel_alt": "relative", "abs_alt": "absolute"} | {
+    f"{old}{angle}": f"{new}_{angle}"
+    for old, new in (("gimbal_", "gb"), ("gb_", "gb"), ("drone_", "drone"), ("uav_", "drone"))
+    for angle in ("yaw", "pitch", "roll")
+}
 
 
 class DjiSrtFormat(DroneLog):
@@ -344,16 +346,16 @@ def _columns(texts: Sequence[str]) -> dict[str, Float]:
     """Return all columns of `_COLUMNS`, [B] each, NaN if a subtitle does not hold the value."""
     columns = {name: np.full(len(texts), np.nan) for name in _COLUMNS}
     for row, text in enumerate(texts):
-        for name in (fields := _fields(text)).keys() & columns:
-            columns[name][row] = fields[name]
+        for name, value in _fields(text).items():
+            columns[name][row] = value
     return columns
 
 
 def _fields(text: str) -> dict[str, float]:
     fields: dict[str, float] = {}
     for key, number in _PAIR.findall("]".join(_BRACKETS.findall(text))):
-        name = key.lower()
-        fields[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number.replace(",", "."))
+        if (name := _NAMES.get(key.lower())) is not None:
+            fields[name] = float(number.replace(",", "."))
     if "GPS" in text and (gps := _GPS.search(text)):
         first, second, third = (float(part) for part in gps.groups()[:3])
         if gps[4]:  # the M of a height: only this form begins with the latitude
