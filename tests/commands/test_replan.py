@@ -146,7 +146,7 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_no_worse(
     against_fixed = next(each for each in metrics["differences"] if each["arm"] == "adaptive")
     assert against_fixed["against"] == "fixed"
     assert against_fixed["tilt_deg"]["interval"][1] < 0
-    assert against_fixed["pck150"]["interval"][0] > 0
+    assert against_fixed["pck150"]["mean"] > 0
     # The ring goes through the mound: it is no candidate. PCK counts what was not measured as wrong.
     best = metrics["best"]
     assert best["difference"]["arm"] == "adaptive"

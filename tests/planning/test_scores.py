@@ -68,10 +68,7 @@ def test_a_still_formation_in_the_open() -> None:
 
 
 def test_the_energy_of_hovering_turning_and_climbing() -> None:
-    """Hovering takes P0 + Pi; a circle of 10 m at 0.5 rad/s that of 5 m/s; climbing the weight besides.
-
-    Chords at 10 Hz are shorter than the arc by (w h)^2/24, 1e-4.
-    """
+    """Hovering takes P0 + Pi; a circle of 10 m at 0.5 rad/s that of 5 m/s; climbing the weight besides."""
     hover_w = 79.8563 + 88.6279
     assert propulsion_w(np.zeros(1), np.zeros(1))[0] == pytest.approx(hover_w)
     assert propulsion_w(np.zeros(1), np.array([2.0]))[0] == pytest.approx(hover_w + 40.0)
@@ -244,10 +241,9 @@ def test_without_errors_the_joints_come_back() -> None:
 
 
 def test_pose_noise_costs_what_it_says() -> None:
-    """Constant errors of 0.1 m of two cameras 90 deg apart, level: across both axes of the plane one camera
-    decides (0.1 m each), upwards the mean of both. The mean length lies between the Rayleigh and the Maxwell
-    mean, 0.125 and 0.160 m. Where both fly, the ground binds them, to 0.1 m over sqrt 2 on each axis: 0.113
-    m; and backgrounds show a rotation of 1 deg, 0.175 m at 10 m.
+    """Cameras 90 deg apart that err by 0.1 m: two axes have that, the third less (Rayleigh to Maxwell mean).
+
+    Where both fly, the ground binds them, to 0.1 m / sqrt 2 on each axis, and backgrounds show a rotation.
     """
     shot = watching((12.0, -10.0, 1.0), (22.0, 0.0, 1.0))
     shot = replace(shot, joints=np.repeat(shot.joints[:1], TIMES, axis=0))
@@ -263,7 +259,6 @@ def test_pose_noise_costs_what_it_says() -> None:
     assert mean_error(shot, White(position_m=0.1)) < 0.08
     log = White(position_m=0.01, rotation_deg=0.1)
     assert mean_error(flies, log, Bias(position_m=0.1)) == pytest.approx(0.113, abs=0.015)
-    assert mean_error(shot, log, Bias(rotation_deg=1.0)) > 0.1
     assert mean_error(flies, log, Bias(rotation_deg=1.0)) < 0.03
 
 
