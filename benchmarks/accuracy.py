@@ -7,8 +7,8 @@ model, or neither it nor the logs give anything. Every method gets the same sess
 `mocap reconstruct`. "True poses" is `robust` with them; "shared error" has them moved and turned together by
 the error that all cameras of a draw share: no picture shows that error, so no method can remove it.
 
-To save time, methods share the clocks that the first of them found by keypoints, and mistakes are searched
-for in the call alone whose time is taken. Results are kept in build/accuracy by the hash of the code and of
+To save time, methods share the clocks that the first of them found by keypoints, and no mistakes are searched
+for. Results are kept in build/accuracy by the hash of the code and of
 the flight's files, so an interrupted run continues, and a changed program measures anew.
 """
 
@@ -19,10 +19,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from hashlib import sha256
+from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
@@ -44,7 +44,6 @@ from pipelines.geometry.metrics import measure
 from pipelines.reconstruct import RECONSTRUCT, ReconstructSettings, reconstruct
 from pipelines.reconstruction.clocks import FoundClocks
 from pipelines.reconstruction.refining import RobustFlight, find_clocks
-from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
 from pipelines.session.people import true_joints_at
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
@@ -58,13 +57,7 @@ WORK = ROOT / "build" / "accuracy"
 FLOOR: Final = "floor"
 SHARED: Final = "shared"
 _POSES: dict[str, Poses] = {FLOOR: "true", SHARED: "shared"}
-METHODS: dict[str, dict[str, Any]] = {
-    "robust": {"method": "robust"},
-    "refined": {"method": "refined"},
-    "background": {"method": "robust", "refine_cameras": "background"},
-    "both": {"method": "refined", "refine_cameras": "background"},
-    "auto": {"method": "auto"},
-}
+METHODS = ("robust", "refined", "auto")
 SPECIAL: dict[str, tuple[str, Any]] = {
     "background": ("reconstruction.background._MOST_UNBOUND", -1.0),
     "ground": ("reconstruction.ground._FEWEST_PATCHES", 10**9),
@@ -80,14 +73,9 @@ SPECIAL: dict[str, tuple[str, Any]] = {
     ),
 }
 """Special cases of `auto`: the name in pipelines that is replaced, and the value without the case."""
-ALWAYS = ("auto", "robust")
-"""Methods that are measured on all draws; the first finds the clocks, and its time is taken."""
 GIVEN: tuple[Given, ...] = ("model", "nothing")
 FLEXIONS = ("hip_flexion", "knee_flexion", "elbow_flexion")
-_FASTEST_SHARE = 0.05
-_FAST_MPS = 1.0
 _IN_95 = 7.814727903251179  # 95 % quantile of chi-square with 3 degrees of freedom
-_WRISTS_AND_ANKLES = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 
 
 @dataclass(frozen=True)
@@ -95,7 +83,7 @@ class Case:
     """One reconstruction, to be measured."""
 
     flight: str
-    method: str  # of METHODS, FLOOR or SHARED
+    method: str  # of METHODS or SPECIAL, FLOOR or SHARED
     detector: str
     given: Given = "model"
     draw: int = 0
@@ -108,11 +96,9 @@ class Outcome:
     mpjpe_mm: float | None = None
     root_mpjpe_mm: float | None = None
     acceleration_mps2: float | None = None
-    peak_ratio: float | None = None
     nees: float | None = None
     inside: float | None = None
     measured_share: float | None = None
-    cpu_s: float | None = None  # of the first method of the first draw
     hip_flexion_deg: float | None = None  # RMSE against the angles of the true joints
     knee_flexion_deg: float | None = None
     elbow_flexion_deg: float | None = None
@@ -123,9 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `corpus`."""
     parser.add_argument("--flights", nargs="+", default=["all"], help="tuning, kept, all, or names")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="on all draws (default: auto robust)")
-    parser.add_argument(
-        "--special", action="store_true", help="also `auto` without each of its special cases"
-    )
+    parser.add_argument("--special", action="store_true", help="`auto` without each of its special cases")
     parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[0])
     parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--processes", type=int, default=2)
@@ -134,7 +118,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
     """Measure, print a line for each flight, and yield the tables of the page."""
     chosen = chosen_flights(options.flights, options.detector)
-    methods = options.methods or list(ALWAYS)
+    methods = options.methods or ["auto", "robust"]  # the first finds the clocks
     if options.special:
         found = measured(chosen, ["auto", *SPECIAL], options.detector, options.draws, options.processes)
         yield "corpus-special", special_table(chosen, found)
@@ -184,7 +168,7 @@ def measured(
                 for said in GIVEN
             ),
         ]
-        for flight in sorted(chosen, key=_effort, reverse=True)
+        for flight in chosen
     ]
     found: dict[Case, Outcome] = {}
     began_s = time.perf_counter()
@@ -198,12 +182,6 @@ def measured(
             took_s = time.perf_counter() - began_s
             print(f"{number} of {len(work)} flights after {took_s:.0f} s", file=sys.stderr, flush=True)
     return found
-
-
-def _effort(flight: Flight) -> tuple[bool, int]:
-    """Order flights by how long they take: unknown clocks most of all, then cameras."""
-    drones = flight.scenario.drones
-    return any(drones.clock_offsets_s), drones.count
 
 
 @cache
@@ -226,7 +204,7 @@ def _outcomes_of(code: str, shared: Path, groups: Sequence[Sequence[Case]]) -> d
     place.mkdir(parents=True, exist_ok=True)
     drawn = DrawnFlight(flight, shared / flight.name)
     clocks_of_true_poses: dict[bytes, FoundClocks] = {}
-    paths = {case: place / f"{_name_of(case)}.json" for group in groups for case in group}
+    paths = {case: place / f"{case.method}-{case.given}-{case.draw}.json" for case in chain(*groups)}
     for group in groups:
         missing = [case for case in group if not paths[case].is_file()]
         clocks = clocks_of_true_poses if group[0].method in _POSES else {}
@@ -235,10 +213,6 @@ def _outcomes_of(code: str, shared: Path, groups: Sequence[Sequence[Case]]) -> d
             partial_path.write_text(json.dumps(asdict(outcome)), encoding="utf-8")
             partial_path.replace(paths[case])
     return {case: Outcome(**json.loads(path.read_text(encoding="utf-8"))) for case, path in paths.items()}
-
-
-def _name_of(case: Case) -> str:
-    return f"{case.flight}-{case.method}-{case.given}-{case.draw}"
 
 
 def _files_hash(flight: Flight, detector: str) -> str:
@@ -272,33 +246,27 @@ def measure_draw(
         with (
             kept_in_place_of_pictures(flight, first.detector),
             patch("pipelines.reconstruct.find_clocks", find_once),
+            patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []),
         ):
             with locked(session) as writable:
                 detect(writable, detector=first.detector)
                 if flight.with_pictures:
                     follow(writable)
             for case in cases:
-                timed = case is first and not case.draw
                 name, value = SPECIAL.get(case.method, ("reconstruct.RECONSTRUCT", RECONSTRUCT))
-                method = METHODS.get(case.method, METHODS["robust" if case.method in _POSES else "auto"])
-                settings = ReconstructSettings(**method, people=1, detector=first.detector)
-                began_s = time.process_time()
+                method: Any = case.method if case.method in METHODS else "auto"
+                method = "robust" if case.method in _POSES else method
+                settings = ReconstructSettings(method=method, people=1, detector=first.detector)
                 try:
-                    quick = nullcontext() if timed else patch("pipelines.reconstruct.doubts_of", _no_doubts)
-                    with quick, patch(f"pipelines.{name}", value):
+                    with patch(f"pipelines.{name}", value):
                         reconstruct(session, settings, force=True)
                 except DataError as error:
                     yield case, Outcome(error=str(error))
                 else:
-                    took_s = time.process_time() - began_s if timed else None
-                    yield case, _outcome(session, took_s)
+                    yield case, _outcome(session)
 
 
-def _no_doubts(*_: object, **__: object) -> list[Doubt]:
-    return []
-
-
-def _outcome(session: Path, took_s: float | None) -> Outcome:
+def _outcome(session: Path) -> Outcome:
     skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON)
     skeleton = skeleton[skeleton["person"] == 0]
     joints = tuple(skeleton["joint"].iloc[: skeleton["joint"].nunique()])
@@ -318,11 +286,9 @@ def _outcome(session: Path, took_s: float | None) -> Outcome:
         errors["mpjpe_mm"],
         errors["root_mpjpe_mm"],
         None if acceleration is None else acceleration / 1e3,
-        peak_ratio(position, truth, joints, t_ns),
         float(squared.mean()),
         float((squared <= _IN_95).mean()),
         errors["reconstructed_share"],
-        took_s,
         **dict(_flexion_errors(session, t_ns, table)),
     )
 
@@ -343,27 +309,6 @@ def nees(error: Float, covariance: Float) -> Float:
     """Compute the squared error in units of its covariance [N], from [N, 3] and [N, 3, 3]."""
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     return np.asarray(np.einsum("ni,ni->n", error, solved), dtype=np.float64)
-
-
-def peak_ratio(position: Float, truth: Float, joints: Sequence[str], t_ns: Any) -> float | None:
-    """Compare the peak speeds of wrists and ankles, [T, J, 3] m, with the true ones; None if all are slow."""
-    ratios = []
-    span_s = (t_ns[2:] - t_ns[:-2])[:, None] / 1e9
-    for name in _WRISTS_AND_ANKLES:
-        if name not in joints:
-            continue
-        speed, true = (
-            np.linalg.norm((path[2:, joints.index(name)] - path[:-2, joints.index(name)]) / span_s, axis=-1)
-            for path in (position, truth)
-        )
-        both = np.isfinite(speed) & np.isfinite(true)
-        if not both.any():
-            continue
-        speed, true = speed[both], true[both]
-        fastest = np.argsort(true)[-max(1, round(_FASTEST_SHARE * len(true))) :]
-        if true[fastest].mean() >= _FAST_MPS:
-            ratios.append(speed[fastest].mean() / true[fastest].mean())
-    return float(np.mean(ratios)) if ratios else None
 
 
 # --- the tables ----------------------------------------------------------------------------------------

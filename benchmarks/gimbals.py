@@ -20,7 +20,6 @@ and sessions stay in FOLDER and are used again; methods are always measured anew
 
 import argparse
 import shutil
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -47,13 +46,6 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
 TUNED, KEPT = ("a", "b"), ("c", "d")
 LEVELS_DEG = (0.5, 1.0)
-METHODS: dict[str, dict[str, Any]] = {
-    "robust": {"method": "robust"},
-    "refined": {"method": "refined"},
-    "background": {"method": "robust", "refine_cameras": "background"},
-    "refined + background": {"method": "refined", "refine_cameras": "background"},
-    "auto": {"method": "auto"},
-}
 _FPS, _SIZE = 60, (720, 960)
 _ZOOM = 0.8  # focal length of the virtual camera over the real one's
 _FOLLOWED_S = 0.3  # the person's centre is followed as slowly as that
@@ -94,14 +86,13 @@ class Figures:
     constant_deg: float
     nees: float
     share_percent: float
-    cpu_s: float
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("folder", type=Path, help="for films and sessions, outside the repository")
     parser.add_argument("--kept", action="store_true", help="measure on the paths that are kept aside")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=["robust", "auto"])
+    parser.add_argument("--methods", nargs="+", default=["robust", "auto"])
     parser.add_argument("--detector", default="blazepose")
     parser.add_argument("--draws", type=int, default=6, help="of the log's errors (default 6)")
 
@@ -273,14 +264,12 @@ def measured(
     for method in methods:
         # The code may have changed since: nothing of an earlier run is taken for a result.
         shutil.rmtree(session / "reconstruct", ignore_errors=True)
-        started_s = time.process_time()
-        reconstruct(session, ReconstructSettings(**METHODS[method], detector=detector), workers=1)
-        taken_s = time.process_time() - started_s
-        found[method] = _figures(session, reference, true, taken_s)
+        reconstruct(session, ReconstructSettings(method=method, detector=detector))  # type: ignore[arg-type]
+        found[method] = _figures(session, reference, true)
     return found
 
 
-def _figures(session: Path, reference: pd.DataFrame, true: dict[str, Float], taken_s: float) -> Figures:
+def _figures(session: Path, reference: pd.DataFrame, true: dict[str, Float]) -> Figures:
     table = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     (ours, covariance), (theirs, _) = (_of_person(skeleton) for skeleton in (table, reference))
     apart = ours - theirs
@@ -294,7 +283,6 @@ def _figures(session: Path, reference: pd.DataFrame, true: dict[str, Float], tak
         constant_deg=constant,
         nees=_nees(apart[both], covariance[both]),
         share_percent=100 * float(both.sum() / np.isfinite(theirs).all(axis=-1).sum()),
-        cpu_s=taken_s,
     )
 
 
@@ -341,7 +329,6 @@ _COLUMNS = {
     "constant_deg": ("constant deg", 2),
     "nees": ("NEES", 1),
     "share_percent": ("measured %", 1),
-    "cpu_s": ("CPU s", 1),
 }
 
 

@@ -69,15 +69,15 @@ SECTIONS = (
     ),
     Section(
         "Real pictures",
-        "Pose2Sim's demo: one person, four still cameras, no truth. Gimbals are virtual: crops of the"
-        " videos pan, tilt, roll and shake along known paths, and errors of the logged attitudes are"
-        " drawn. The reference is `robust` from the still cameras.",
+        "Pose2Sim's demo: one person, four still cameras. Virtual gimbals crop and turn the videos along"
+        " known paths; errors of logged attitudes are drawn. The reference is `robust` from still cameras.",
         (
             Part("gimbals-kept", "Cameras that turn", REAL, KEPT),
             Part("gimbals-tuned", "Cameras that turn", REAL, TUNED),
             Part("attitudes-kept", "Attitudes from pictures", RENDERED, KEPT),
             Part("attitudes-tuned", "Attitudes from pictures", RENDERED, TUNED),
-            Part("detectors", "Detectors, and the distance from Pose2Sim's skeleton", REAL, ""),
+            Part("joined", "No log, stature stated", RENDERED, f"two {TUNED}"),
+            Part("detectors", "Detectors", REAL, ""),
         ),
     ),
     Section(
@@ -178,7 +178,7 @@ def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
         "# Results",
         "",
         *_words(
-            "All figures of this project, each table with kind, command (or that above), date and commit."
+            "All figures of this project, with kind, command (or that above), date and commit."
             " `python -m benchmarks.results` measures the sample again and writes this page; the other"
             " commands replace their tables with `--write`. No constant was chosen because of flights kept"
             " aside. Closed loops of planners amplify rounding: other processors change their figures by up"

@@ -91,9 +91,9 @@ _MIN_DURATION_S = 0.5
 _MIN_MESSAGES = 5
 # So many of the messages before and after lie nearer to their own median than to the other one.
 _SEPARATED_SHARE = 0.9
-# A log with more gaps loses messages all the time. Its gaps say nothing of clocks, other than so many that
-# are longer than the next one by this factor: two messages in a row are lost far less often than one.
+# A log with more gaps loses messages all the time, and its gaps say nothing of clocks, but for the longest.
 _MOST_GAPS = 3
+# So many gaps count if the next one is shorter by this factor: two messages in a row are seldom lost.
 _DISTINCT_GAP = 1.75
 # A mean velocity over less time is mostly noise.
 _VELOCITY_S = 0.2

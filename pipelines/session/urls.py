@@ -349,7 +349,11 @@ def _asked(url: str, call: Callable[[Any, str], T], *, missing: type[Exception] 
             raise DataError(url, problem, remedy, code="url-refused") from None
         if isinstance(error, OSError) and error.errno in _FULL:
             raise
-        if isinstance(error, FileNotFoundError | NotADirectoryError):
+        lacks = isinstance(error, FileNotFoundError | NotADirectoryError)
+        if lacks and url.startswith("http") and names - {"FileNotFoundError", "ClientResponseError"}:
+            problem = f"cannot be asked for ({type(chain[-1]).__name__})"
+            raise DataError(url, problem, "check the URL and the network", code="store-unreachable") from None
+        if lacks:
             if missing is not None:
                 raise missing(url) from None
             raise DataError(url, "does not exist", "check the URL", code="no-such-file") from None

@@ -189,6 +189,8 @@ def test_nothing_is_fetched_from_private_addresses_nor_by_redirection(
         for host in ("127.0.0.1", "localhost", "0.0.0.0"):  # noqa: S104
             with refusing("url-refused"):
                 fetched(f"http://{host}:{server.server_port}/secret")
+        with refusing("store-unreachable"):  # what was not asked for may exist
+            fetched("http://127.1/secret")
         assert not Redirecting.asked
         monkeypatch.setattr(urls, "is_public", "127.0.0.1".__eq__)  # stands for a server of the Internet
         assert fetched(f"http://127.0.0.1:{server.server_port}/secret").read_bytes() == b"secret"
