@@ -64,7 +64,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=15)
+FILM = Stage("film", revision=16)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -452,12 +452,7 @@ def _between(t_ns: Int64) -> Interpolation:
 
 
 def _measured(
-    arm: _Arm,
-    of: Walk,
-    sightings: SimulatedKeypoints,
-    cameras: Sequence[Sequence[Camera]],
-    *,
-    seed: int,
+    arm: _Arm, of: Walk, sightings: SimulatedKeypoints, cameras: Sequence[Sequence[Camera]], *, seed: int
 ) -> tuple[Float, MeasuredJoints, dict[str, Any]]:
     """Reconstruct a person [T, J, 3] in cameras [K, N] of K draws, with errors, and measure the arm."""
     elapsed_s = (of.t_ns - of.t_ns[0]) / 1e9

@@ -170,6 +170,9 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
     best = judge(measured, breaking)
     broken = [line for name, arm in arms.items() if (line := broken_limits(name, arm, scene.config))]
     settings, flight = scene.settings, scene.flight
+    words = [*broken, verdict(best, list(arms))]
+    if best is not None and best["untold"] and settings.trials >= FEW_TRIALS:  # more draws would not help
+        words.append("the model may be off by as much: film them (--render, if the flight is simulated)")
     return {
         "schema": 1,
         "simulated": True,  # replays are, and every reconstruction error
@@ -195,7 +198,7 @@ def compare(scene: ReplayScene, results: Mapping[str, ArmResult]) -> dict[str, A
             }
             for names in alike
         ],
-        "verdict": "; ".join([*broken, verdict(best, list(arms)), *_untold(best)]),
+        "verdict": "; ".join(words),
         "notes": list(scene.notes),
         "warnings": [*broken, *_unequal(arms), *scene.warnings, *_warnings(scene, results)],
     }
@@ -302,6 +305,12 @@ def worth_flying(difference: Mapping[str, MeanWithInterval | None]) -> list[int]
     return found
 
 
+def is_untold(difference: Mapping[str, MeanWithInterval | None]) -> bool:
+    """Test if a difference is large enough to be worth flying in a figure, but may be chance in all."""
+    large = (abs(found["mean"]) >= _DECISIVE[name][0] for name in _DECISIVE if (found := difference[name]))
+    return any(large) and not any(worth_flying(difference))
+
+
 def judge(
     measured: Mapping[str, MeasuredJoints], breaking: Collection[str], t_ns: Int64 | None = None
 ) -> dict[str, Any] | None:
@@ -328,10 +337,12 @@ def judge(
         unbeaten, worse = kept, []
     first, second = unbeaten[0], (unbeaten[1:] or worse or left_out)[0]
     disagreeing = next((pair for pair in permutations(unbeaten, 2) if judged[pair] == [1, -1]), None)
-    first, second = disagreeing or (first, second)
+    untold = next((pair for pair in permutations(unbeaten, 2) if is_untold(change[pair])), None)
+    first, second = disagreeing or untold or (first, second)
     return {
         "arms": unbeaten,
         "disagree": disagreeing is not None,
+        "untold": untold is not None and disagreeing is None,
         "worse": worse,
         "left_out": left_out,
         "difference": {"arm": first, "against": second, **change[first, second]},
@@ -339,7 +350,7 @@ def judge(
 
 
 def outcome(best: Mapping[str, Any]) -> str:
-    """Say which arm is better, that none is, or that the figures disagree."""
+    """Say which arm is better, that none is or can be told, or that the figures disagree."""
     arm, other = best["difference"]["arm"], best["difference"]["against"]
     worse = " and ".join(sorted(best["worse"]))
     if best["disagree"]:
@@ -347,7 +358,8 @@ def outcome(best: Mapping[str, Any]) -> str:
     if len(best["arms"]) == 1:
         return f"{arm} is better than {worse}" if worse else f"only {arm} keeps its limits"
     rest = f", at least one of them better than {worse}" if worse else ""
-    return f"no difference worth flying ({WORTH}) between {' and '.join(sorted(best['arms']))}{rest}"
+    none = "too uncertain to choose" if best["untold"] else f"no difference worth flying ({WORTH})"
+    return f"{none} between {' and '.join(sorted(best['arms']))}{rest}"
 
 
 def verdict(best: Mapping[str, Any] | None, names: Sequence[str]) -> str:
@@ -363,18 +375,6 @@ def verdict(best: Mapping[str, Any] | None, names: Sequence[str]) -> str:
     return f"{outcome(best)}{pair}: {figures}{left}"
 
 
-def _untold(best: Mapping[str, Any] | None) -> list[str]:
-    """Say if a modelled difference is large enough to count, but not beyond what the model may be off by."""
-    if best is None:
-        return []
-    for name, (smallest, _) in _DECISIVE.items():
-        change = best["difference"][name]
-        ends = change and change["interval"]
-        if ends and ends[0] <= 0.0 <= ends[1] and abs(change["mean"]) >= smallest:
-            return ["the model cannot tell them apart: film them (--render)"]
-    return []
-
-
 def filmed_verdict(
     best: Mapping[str, Any] | None, modelled: Mapping[str, Any] | None, names: Sequence[str]
 ) -> str:
@@ -382,7 +382,7 @@ def filmed_verdict(
     if best is not None and (best["difference"]["pck150"] or {}).get("interval") is None:
         return f"filmed: too few pictures to tell {' and '.join(names)} apart"
     words = f"filmed: {verdict(best, names)}"
-    if best is None or modelled is None or outcome(best) == outcome(modelled):
+    if best is None or modelled is None or modelled.get("untold") or outcome(best) == outcome(modelled):
         return words
     return f"{words}. The model said otherwise ({outcome(modelled)}): the film counts"
 

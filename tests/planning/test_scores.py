@@ -152,6 +152,10 @@ def test_a_film_is_a_draw_of_its_own() -> None:
     assert outcome(best) in says_both
     assert outcome(modelled) in says_both
     assert filmed_verdict(best, best, ["one", "other"]) == f"filmed: {verdict(best, ['one', 'other'])}"
+    # A single draw tells nothing, however large its difference.
+    once = judge({name: MeasuredJoints(error[:1] * k, 400) for name, k in (("one", 1), ("other", 2))}, ())
+    assert once is not None
+    assert (once["untold"], once["arms"]) == (True, ["one", "other"])
 
 
 def test_an_arm_that_sees_nothing_loses_and_one_that_alone_keeps_its_limits_is_named() -> None:
