@@ -189,7 +189,8 @@ def _triangulate_block(
         view = np.concatenate([rays, direction, length2[..., None], *noise], axis=-1)
         pairs = _pair_table(seen.shape[1])
         fit_robustly(view, poses.rows, at, *pairs, gate**2, cos2_min, point, inlier, status)
-    place = (rotation.mT @ (point[:, None] - centre)[..., None])[..., 0]
+    if method != "robust" or with_covariance:
+        place = (rotation.mT @ (point[:, None] - centre)[..., None])[..., 0]
     if method != "robust":
         behind = (seen & ~(place[..., 2] > 0)).any(axis=1)
         status[(status == 0) & behind] = STATUS.index("rejected")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, pairwise
+from itertools import pairwise, starmap
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -638,12 +638,13 @@ class _Smoother:
         self._paths, self._joints = paths, joints
         self._pixel = np.array([(PIXEL_SIGMA_PX / _focal(lens)) ** 2 for lens in paths.intrinsics])[:, None]
         across, square_m2 = _across_ray(paths.position[:, :, None] - joints)
-        self._information = across / (self._pixel[..., None] * square_m2)[..., None, None]  # [N, T, J, 3, 3]
+        own = across / (self._pixel[..., None] * square_m2)[..., None, None]
+        self._information = np.moveaxis(own, 0, -1).reshape(*joints.shape[:2], 9, -1).copy()  # [T, J, 9, N]
 
     def passed(self, rays: Float, seen: Bool) -> Float:
         """Compute by how much (m) rays [T, J, N, 2] pass joints that are seen [T, J, N]: means [T, N, 3]."""
         rotation = matrix_from_quaternion(self._paths.quaternion_xyzw)
-        along = np.einsum("ntab,tjnb->ntja", rotation, np.append(rays, np.ones_like(rays[..., :1]), axis=-1))
+        along = np.append(rays, np.ones_like(rays[..., :1]), axis=-1).transpose(2, 0, 1, 3) @ rotation.mT
         along /= np.linalg.norm(along, axis=-1, keepdims=True)
         away = self._joints - self._paths.position[:, :, None]
         past = along * (along * away).sum(axis=-1, keepdims=True) - away
@@ -656,15 +657,14 @@ class _Smoother:
     def own(self, off: Float, seen: Bool) -> Float:
         """Smooth what errors [T, J, 3] m do not share, of joints that cameras see, [T, J, N]; NaN stays."""
         there = np.isfinite(off[..., 0])
-        own = np.einsum("tjc,ctjab->tjab", seen.astype(np.float64), self._information)
+        own = (self._information @ seen[..., None].astype(np.float64)).reshape(*there.shape, 3, 3)
         total = own.sum(axis=1) + np.eye(3) / FARTHEST_M**2
         weighted = np.einsum("tjab,tjb->ta", own, np.where(there[..., None], off, 0.0))
         shared = np.linalg.solve(total, weighted[..., None])[:, None, :, 0]
         series = np.where(there[..., None], off - shared, 0.0)
         if len(off) >= MIN_SMOOTHED_TIMES:
-            for j, stiff in enumerate(self._stiffness[1:]):
-                right = np.einsum("tab,tb->ta", own[:, j], series[:, j])
-                series[:, j] = smooth(right[..., None], own[:, j], stiff)[..., 0]
+            right = (own @ series[..., None]).swapaxes(0, 1)
+            series = smooth(right, own.swapaxes(0, 1), self._stiffness[1:])[..., 0].swapaxes(0, 1)
         return np.where(there[..., None], series, np.nan)
 
     def shared(self, passed: Float, logged: Float) -> Float:
@@ -684,26 +684,26 @@ class _Smoother:
         own = [self._unknowns(i) for i in range(cameras)]
         ends = np.cumsum([0, *(of.prior.shape[0] for of in own)])
         normal, right = np.zeros((ends[-1], ends[-1])), np.zeros((ends[-1], trials))
-        pulled = np.zeros((times, 3, ends[-1]))
-        columns = [slice(first, stop) for first, stop in pairwise(ends.tolist())]
-        for i, (of, mine) in enumerate(zip(own, columns, strict=True)):
-            pulled[..., mine] = weight[i] @ of.at_person
+        pulled, paired = [], np.zeros((cameras, 7, cameras, 7))
+        for i, (of, mine) in enumerate(zip(own, starmap(slice, pairwise(ends)), strict=True)):
+            pulled.append(weight[i] @ of.at_person)
             normal[mine, mine] = of.prior + _squared(of.of_log, of.of_log)
-            normal[mine, mine] += _squared(of.at_person, pulled[..., mine])
             errors = logged[:, :, i].transpose(1, 2, 0) / of.log_sigma[:, None]
-            right[mine] = _squared(of.of_log, errors) - _squared(of.at_person, seen[i])
-        for (one, a), (other, b) in combinations(list(zip(own, columns, strict=True)), 2):
-            for x, y, left, top in ((one, one, a, a), (other, other, b, b), (one, other, a, b)):
-                both = _squared(x.at_ground, y.at_ground) / (times * GROUND_SIGMA_M**2)
-                normal[left, top] += both if left == top else -both
-            normal[b, a] = normal[a, b].T
+            right[mine] = _squared(of.of_log, errors)
+            right[mine][:7] -= _squared(of.at_person, seen[i])
+            paired[i, :, i] += _squared(of.at_person, pulled[i])
+            for k, other in enumerate(own):
+                both = _squared(of.at_ground, other.at_ground) / (times * GROUND_SIGMA_M**2)
+                paired[i, :, k] += (cameras - 1) * both if i == k else -both
         # The shared error is eliminated: it is smooth, whatever the cameras are.
-        sides = np.concatenate([seen.sum(axis=0), pulled], axis=-1)
+        sides = np.concatenate([seen.sum(axis=0), *pulled], axis=-1)
         smoothed = smooth(sides, weight.sum(axis=0), self._stiffness[0])
-        normal -= _squared(pulled, smoothed[..., trials:])
-        right += _squared(pulled, smoothed[..., :trials])
+        first = (ends[:-1, None] + np.arange(7)).ravel()  # background's numbers
+        both = _squared(sides[..., trials:], smoothed)
+        normal[np.ix_(first, first)] += paired.reshape(2 * first.shape) - both[:, trials:]
+        right[first] += both[:, :trials]
         normal[np.diag_indices_from(normal)] += LEAST_INFORMATION
-        found = np.linalg.solve(normal, right)
+        found = np.linalg.solve(normal, right)[first]
         error: Float = (smoothed[..., :trials] + smoothed[..., trials:] @ found).transpose(2, 0, 1)
         return error
 
@@ -733,14 +733,8 @@ class _Smoother:
         from scipy.linalg import block_diag
 
         prior = block_diag(*priors)
-        none = np.zeros((len(t_s), 3, len(prior) - 7))
-        return _Unknowns(
-            prior,
-            np.concatenate(of_log, axis=-1) / log_sigma[:, None],
-            log_sigma,
-            np.append(at_person, none, axis=-1),
-            np.append(_moved(ground), none, axis=-1),
-        )
+        in_sigmas = np.concatenate(of_log, axis=-1) / log_sigma[:, None]
+        return _Unknowns(prior, in_sigmas, log_sigma, at_person, _moved(ground))
 
 
 class _Unknowns(NamedTuple):
@@ -749,8 +743,8 @@ class _Unknowns(NamedTuple):
     prior: Float  # [M, M] precision
     of_log: Float  # [T, 6, M] errors of logged poses, in standard deviations
     log_sigma: Float  # [6] these, m and rad
-    at_person: Float  # [T, 3, M] m, displacement of what it sees at the person
-    at_ground: Float  # [T, 3, M] m, and at the ground below
+    at_person: Float  # [T, 3, 7] m, displacement of what it sees at the person
+    at_ground: Float  # [T, 3, 7] m, and at the ground below
 
 
 def _moved(place: Float) -> Float:
@@ -779,27 +773,27 @@ def _squared(one: Float, other: Float) -> Float:
 
 def _across_ray(offset: Float) -> tuple[Float, Float]:
     """Return projections [..., 3, 3] across offsets [..., 3] m, and the squares of their lengths."""
-    square = np.sum(offset**2, axis=-1)
+    square = np.maximum(np.sum(offset**2, axis=-1), EXACT**2)
     return np.eye(3) - offset[..., :, None] * offset[..., None, :] / square[..., None, None], square
 
 
-def smooth(right: Float, information: Float, stiffness: float) -> Float:
-    """Minimise sum x' W x / 2 - x' r + stiffness sum |x''|^2 / 2 for r [T, 3, K] and W [T, 3, 3] or 0."""
+def smooth(right: Float, information: Float, stiffness: Float) -> Float:
+    """Minimise sum x'Wx / 2 - x'r + s sum |x''|^2 / 2 for r [..., T, 3, K], W [..., T, 3, 3], s [...]."""
     from scipy.linalg import solveh_banded
 
-    times = len(right)
+    times, stiff = information.shape[-3], np.reshape(stiffness, (-1, 1, 1))
     bend = np.zeros((3, times, 1))  # squares of second differences by lag, 0 to 2, and the later time
     bend[0, :-2] += 1.0
     bend[0, 1:-1] += 4.0
     bend[:, 2:] += np.array([1.0, -2.0, 1.0])[:, None, None]
     bend[1, 1:-1] -= 2.0
-    band = np.zeros((7, times, 3))
+    band = np.zeros((7, len(stiff), times, 3))  # of all series in a row: nothing joins one to the next
     for a, b in zip(*np.tril_indices(3), strict=True):
-        band[6 - a + b, :, a] = information[:, a, b]
+        band[6 - a + b, ..., a] = information[..., a, b]
     if times >= MIN_SMOOTHED_TIMES:
-        band[[6, 3, 0]] += stiffness * bend
-    band[6] += LEAST_INFORMATION + LEAST_OF_STIFFNESS * stiffness
-    return solveh_banded(band.reshape(7, -1), right.reshape(3 * times, -1)).reshape(right.shape)
+        band[[6, 3, 0]] += stiff * bend[:, None]
+    band[6] += LEAST_INFORMATION + LEAST_OF_STIFFNESS * stiff
+    return solveh_banded(band.reshape(7, -1), right.reshape(-1, right.shape[-1])).reshape(right.shape)
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
