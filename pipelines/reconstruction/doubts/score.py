@@ -18,6 +18,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Index, Int64, known_median
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.geometry.triangulation import MIN_PARALLAX_DEG
 from pipelines.reconstruction.doubts.scene import (
     FEW,
     JOINTS,
@@ -557,9 +558,14 @@ def _spread(values: Float) -> float:
 
 
 def residuals_px(scene: SceneOfMoments) -> list[float]:
-    """Return the median distances (px) of keypoints from their joints: of all, then by camera."""
+    """Return the median distances (px) of keypoints from joints: of all, then by camera; NaN without any.
+
+    Joints whose rays do not cross fall into the cameras, and are missed by nothing: they do not count.
+    """
     solved = solve(scene)
     missed, _ = _misses(solved.joints, np.nan_to_num(scene.position), solved.direction)
     pixels = np.linalg.norm(missed, axis=-1) * scene.focal_px[:, None, None]
-    pixels = np.where(solved.seen, pixels, np.nan)
+    mean = solved.direction.sum(axis=0) / np.maximum(solved.views, 1)[..., None]
+    crossing = 1 - (mean**2).sum(axis=-1) > np.sin(np.radians(MIN_PARALLAX_DEG) / 2) ** 2
+    pixels = np.where(solved.seen & crossing, pixels, np.nan)
     return [round(median(each), 2) for each in (pixels, *pixels)]
