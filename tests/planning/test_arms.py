@@ -16,12 +16,7 @@ from pipelines.planning.arms import ADAPTIVE, FIXED, GROUP, JOINT, Arm, RollingO
 from pipelines.planning.config import SETTINGS, Imperfections, PlannerConfig, planner_config
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.forecast import ActorFilter, Forecast
-from pipelines.planning.formation import (
-    FormationPath,
-    costs_of_slots,
-    formation_slots,
-    slot_offsets,
-)
+from pipelines.planning.formation import FormationPath, costs_of_slots, formation_slots, slot_offsets
 from pipelines.planning.imperfections import aimed
 from pipelines.planning.local import (
     ACCELERATION,

@@ -10,12 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from pipelines.planning.config import ErrorModel, PlannerConfig, PlannerTuning
 from pipelines.planning.distance_field import distance_field, in_turn, visible
-from pipelines.planning.formation import (
-    cost_map,
-    costs_of_slots,
-    formation_slots,
-    slot_offsets,
-)
+from pipelines.planning.formation import cost_map, costs_of_slots, formation_slots, slot_offsets
 from pipelines.planning.scores import log_determinant, predicted_error, ray_information
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import occupied_share

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,12 @@ from pipelines.geometry.poses import compose, invert, matrix_from_quaternion, mu
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.alternatives import changed
 from pipelines.reconstruction.doubts.diagnosis import TIMES, diagnose
+from pipelines.reconstruction.doubts.logs import doubts_of_logs
 from pipelines.reconstruction.doubts.scene import Oddity, SceneOfMoments, scene_of
 from pipelines.reconstruction.doubts.score import score
 from pipelines.reconstruction.doubts.turning import Lateness
 from pipelines.session.description import DOUBT_CODES, read_description
+from pipelines.session.records import Trajectory
 from tests.commands.runner import refused, succeeds
 from tests.synthetic.described_flights import (
     COCO_SWAPPED,
@@ -568,3 +571,17 @@ def test_errors_far_larger_than_stated_are_noise(tmp_path: Path) -> None:
     # Errors were stated a tenth of what they are; one of the factors 2, 4 and 8 is nearest.
     stated = YAML(typ="safe").load(manifest.read_text())["cameras"]["drone1"]["pose_noise"]["white"]
     assert 0.5 / 4 <= stated["position_m"] <= 0.5 * 1.6
+
+
+# Stamps of today have 19 digits, which no float holds.
+@pytest.mark.parametrize("start_ns", [0, 1_764_403_200_000_000_129, 1_764_403_200_000_000_127])
+def test_logs_that_are_alike_and_logs_that_start_at_one_place_are_doubted(start_ns: int) -> None:
+    def logged(east_mps: float) -> tuple[Any, Trajectory]:
+        poses = SimpleNamespace(static=False, source=f"{east_mps}.tum", topic=None)
+        t_ns = start_ns + 100_000_000 * np.arange(61, dtype=np.int64)
+        east = np.outer(east_mps * np.arange(61) / 10, [1.0, 0.0, 0.0])
+        return SimpleNamespace(poses=poses), Trajectory(t_ns, east, np.tile([0.0, 0.0, 0.0, 1.0], (61, 1)))
+
+    assert [doubt.code for doubt in doubts_of_logs({"a": logged(2.0), "b": logged(2.0)})] == ["pose"]
+    (own,) = doubts_of_logs({"a": logged(2.0), "b": logged(-2.0)})
+    assert (own.code, own.evidence["apart_m"]) == ("origin", pytest.approx(12.0, abs=0.5))

@@ -18,13 +18,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.parallel import Waiting
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
-from pipelines.session.tables import (
-    SKELETON,
-    join_tables,
-    motion_from,
-    read_motion,
-    read_table,
-)
+from pipelines.session.tables import SKELETON, join_tables, motion_from, read_motion, read_table
 
 NUMBERS = st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False)
 VALUES = st.recursive(

@@ -139,9 +139,7 @@ def test_messages_of_another_topic_in_the_gap_show_that_time_passed(tmp_path: Pa
 
 
 @pytest.mark.parametrize(("height_m", "axes"), [(-5.0, "ned"), (5.0, None)])
-def test_airsims_topic_of_another_node_is_known_by_its_heights(
-    tmp_path: Path, height_m: float, axes: str | None
-) -> None:
+def test_heights_tell_axes_of_airsims_odometry(tmp_path: Path, height_m: float, axes: str | None) -> None:
     pose = {"pose": {"position": {"z": height_m}, "orientation": {"w": 1.0}}}
     sent = [Entry("/sim/d1/odom_local_ned", TYPES["/pose"], t_ns, pose) for t_ns in TIMES_NS[:9].tolist()]
     log = write_log(tmp_path, "log", "ros1", sent)
