@@ -166,6 +166,11 @@ class BodyModel:
                 name = parent
         return found
 
+    @property
+    def centres(self) -> Float:
+        """Joints of the bones [22, 3] in the neutral pose from the pelvis, relative to the stature."""
+        return np.asarray(self.reach(np.arange(len(BONES)), np.zeros((len(BONES), 3)))[0].sum(axis=1))
+
     def rotations(self, world_from_rest: Float) -> Float:
         """Return rotations [..., 22, 4] relative to this neutral pose, of bones turned so from rest."""
         return multiply(world_from_rest, conjugate(self.neutral_from_rest))

@@ -98,6 +98,11 @@ class Landmarks:
     body_sigma: Float  # [K] spread of the offset between bodies, relative to the stature
     picture_sigma: Float  # [K] spread within a flight, relative to the stature
 
+    @property
+    def at_rest(self) -> Float:
+        """Places [K, 3] in the neutral pose from the pelvis, relative to the stature."""
+        return np.asarray(body_model().centres[self.bone] + self.offset)
+
 
 @cache
 def _tables() -> dict[str, Landmarks]:

@@ -255,7 +255,7 @@ def _contacts() -> tuple[Index, Float]:
     model = body_model()
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1))
     surface = model.surface(np.array([1.0, *np.zeros(11)]), np.zeros(3), upright)
-    centres = model.reach(np.arange(len(BONES)), np.zeros((len(BONES), 3)))[0].sum(axis=1)
+    centres = model.centres
     bones, offsets = [], []
     for side in SIDES:
         for part, ends in (("foot", (np.min, np.max)), ("toes", (np.max,))):

@@ -135,8 +135,8 @@ class PictureMapEntry(Entry):
     key_pictures: int
     mapped: int  # of them
     points: int
-    error_px: float  # mean reprojection error
-    residual_m: float  # root mean square distance of the logged places from the map
+    error_px: float  # median reprojection error
+    residual_m: float | None  # root mean square distance of the logged places from the map
     common_sigma_deg: float  # per axis, of the error that all attitudes share
     picture_sigma_deg: float  # per axis, of the error of each picture
     focal_ratio: float = 1.0  # refined focal length over the stated one

@@ -687,6 +687,7 @@ class Manifest(YamlModel):
                 " of its places, {file: LOG, attitude: pictures}"
             )
         placed = [key for key in ("actor", "actors", "map", "truth", "plan") if getattr(self, key)]
+        placed += ["world.origin"] * (self.world.origin is not None)
         if lone and placed:
             raise ValueError(f"{placed[0]}: `pose: pictures` has a frame of its own: leave it out")
         named = [("clock_reference", self.clock_reference)] if self.clock_reference else []

@@ -25,9 +25,9 @@ from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.reconstruction.background_tracks import Follower
 from pipelines.reconstruction.one_camera import STATED_STATURE_SIGMA_M, STATURE_M
 from pipelines.reconstruction.picture_map import (
+    FAR_SHARE_TO_MAP_AGAIN,
     JOINED,
     LIMB_SIGMA_SHARE,
-    MAX_FAR_SHARE,
     MOST_TRACKS,
     REVISION,
     KeyFeatures,
@@ -45,6 +45,7 @@ from pipelines.reconstruction.picture_map import (
     poses_of_pictures,
     rows_of_film,
     shrunk,
+    sighting_errors_px,
 )
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.description import PictureMapEntry
@@ -140,10 +141,13 @@ class UnposedCamera:
         return key, found
 
     def people(self, t_ns: Int64, found: PictureMap, progress: Progress) -> Float:
-        """Return x/z and y/z [T, P, J, 2] of people's `JOINED` in the pictures next to some times [T]."""
+        """Return x/z and y/z [T, P, J, 2] of people's `JOINED` in the pictures next to some times [T].
+
+        They are NaN where a joint is not seen, and where no picture is near.
+        """
         after = np.searchsorted(self.frames.t_ns, t_ns).clip(1, len(self.frames.t_ns) - 1)
         late = self.frames.t_ns[after] - t_ns > t_ns - self.frames.t_ns[after - 1]
-        numbers = self.frames.frame[after - late].tolist()
+        numbers, apart_ns = self.frames.frame[after - late].tolist(), self.frames.t_ns[after - late] - t_ns
         rows: list[tuple[int, int, Float, Float]] = []
         if self.detections is not None:
             joints, these = self.detections.joints, self.detections
@@ -161,7 +165,7 @@ class UnposedCamera:
                     rows += [(k, who.track, who.person.xy, who.person.confidence) for who in found_here]
                     progress.advance()
         if lacking := [name for name in JOINED if name not in joints]:
-            raise NoAttitudesError(f"its keypoints have no {lacking[0]}")
+            raise NoAttitudesError(f"keypoints have no {lacking[0]}")
         columns, ratio = [joints.index(name) for name in JOINED], found.focal_ratio
         lens = replace(self.intrinsics, fx=ratio * self.intrinsics.fx, fy=ratio * self.intrinsics.fy)
         often = Counter(person for _, person, _, _ in rows).most_common(MOST_TRACKS)
@@ -171,6 +175,7 @@ class UnposedCamera:
             if person in order:
                 sure = confidence[columns] > MIN_JOINED_CONFIDENCE
                 seen[k, order[person]] = np.where(sure[:, None], xy[columns], np.nan)
+        seen[np.abs(apart_ns) > JOINED_STEP_NS // 2] = np.nan
         return undistort(seen.reshape(-1, 2), lens).reshape(seen.shape)
 
 
@@ -252,7 +257,7 @@ def _of_laid(
         mapped=len(found.key),
         points=int(found.seen_point.max()) + 1,
         error_px=laid.error_px,
-        residual_m=laid.residual_m,
+        residual_m=laid.residual_m if np.isfinite(laid.residual_m) else None,
         common_sigma_deg=common_deg,
         picture_sigma_deg=picture_deg,
         focal_ratio=ratio,
@@ -282,7 +287,7 @@ def posed_by_people(
     for name, camera in cameras.items():
         try:
             maps[name] = camera.mapped(progress)
-            if (far := far_share(maps[name][1], camera.intrinsics)) > MAX_FAR_SHARE:
+            if (far := far_share(maps[name][1], camera.intrinsics)) > FAR_SHARE_TO_MAP_AGAIN:
                 raise NoAttitudesError(f"its map contradicts {100 * far:.0f} % of the points that are seen")
         except NoAttitudesError as error:
             problem = f"its film does not say how it moved: {error}"
@@ -321,8 +326,10 @@ def posed_by_people(
             "bias": {"position_m": round(sigma, 4), "rotation_deg": round(common_deg, 4)},
             "white": {"position_m": MAPPED_SIGMA_M, "rotation_deg": round(picture_deg, 4)},
         }
+        error_px = float(np.median(sighting_errors_px(maps[name][1], camera.intrinsics)))
         places = Trajectory(laid.t_ns, laid.position, laid.quaternion_xyzw)
-        turned[name] = _of_laid(camera, name, *maps[name], laid, places, noise, note)
+        whole = replace(laid, error_px=error_px)
+        turned[name] = _of_laid(camera, name, *maps[name], whole, places, noise, note)
     return turned
 
 

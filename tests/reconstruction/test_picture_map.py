@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float, Int64, Intrinsics
-from pipelines.geometry.body_model import body_model
 from pipelines.geometry.cameras import project
 from pipelines.geometry.noise import PoseErrors, White, pose_errors
 from pipelines.geometry.poses import (
@@ -20,7 +19,6 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
     transform,
 )
-from pipelines.geometry.rig import BONES
 from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.reconstruction.body_fit import landmarks_of
 from pipelines.reconstruction.picture_map import (
@@ -203,8 +201,7 @@ def seen_walking(angle: float, along: Float) -> tuple[PeopleSeen, tuple[Float, F
     about = quaternion_from_rotation_vector(np.array([0.0, 0.0, angle]))
     pose = rotate(about, places), multiply(about, turned)
     marks = landmarks_of(["left_mouth", *JOINED]) or pytest.fail("the joints are landmarks")
-    still = body_model().reach(np.arange(len(BONES)), np.zeros((len(BONES), 3)))[0].sum(axis=1)
-    body = dict(zip(marks[0].joints, 1.8 * (still[marks[0].bone] + marks[0].offset), strict=True))
+    body = dict(zip(marks[0].joints, 1.8 * marks[0].at_rest, strict=True))
     joints = along[:, None] + [body[name] for name in JOINED]
     seen = np.stack([transform(invert(*each), at) for *each, at in zip(*pose, joints, strict=True)])
     return PeopleSeen(f"{angle}", mapped(*pose), T_NS, (seen[..., :2] / seen[..., 2:])[:, None]), pose
@@ -227,3 +224,8 @@ def test_cameras_are_joined_by_a_person_whom_they_see() -> None:
     for third in (other, replace(cameras[2], xy=np.full_like(cameras[2].xy, np.nan))):
         with pytest.raises(NoAttitudesError):
             join_maps([*cameras[:2], third], T_NS, 1.8)
+    beside = seen_walking(0.0, np.add(along, [0, 1.0, 0]))[
+        0
+    ].xy  # who of two walks is seen by one camera alone?
+    with pytest.raises(NoAttitudesError):
+        join_maps([replace(cameras[0], xy=np.hstack([cameras[0].xy, beside])), cameras[1]], T_NS, 1.8)
