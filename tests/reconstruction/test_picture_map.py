@@ -221,9 +221,9 @@ def test_cameras_are_joined_by_a_person_whom_they_see() -> None:
         now = replace(laid, quaternion_xyzw=multiply(to_true.quaternion_xyzw, laid.quaternion_xyzw))
         assert np.abs(errors_deg(now, turned)).max() < 0.05
     other = seen_walking(3.4, np.random.default_rng(4).permutation(along))[0]  # or another clock
-    for third in (other, replace(cameras[2], xy=np.full_like(cameras[2].xy, np.nan))):
+    beside = seen_walking(0.0, np.add(along, [0, 1.0, 0]))[0].xy
+    two = [replace(cameras[0], xy=np.hstack([cameras[0].xy, beside])), cameras[1]]  # which one sees whom?
+    unseen = replace(cameras[2], xy=np.full_like(cameras[2].xy, np.nan))
+    for wrong in ([*cameras[:2], other], [*cameras[:2], unseen], two):
         with pytest.raises(NoAttitudesError):
-            join_maps([*cameras[:2], third], T_NS, 1.8)
-    beside = seen_walking(0.0, np.add(along, [0, 1.0, 0]))[
-        0
-    ].xy  # who of two walks is seen by one camera alone?
+            join_maps(wrong, T_NS, 1.8)
