@@ -140,7 +140,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=47)
+RECONSTRUCT = Stage("reconstruct", revision=48)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 

@@ -489,7 +489,7 @@ LESS_USUAL = [
     Mistake("x and y exchanged", ("axes",), _X_AND_Y),
     Mistake("all headings 90 deg", ("pose", "axes", "mount"), of_poses(heading(90))),
     Mistake("all headings -30 deg", ("pose",), of_poses(heading(-30))),
-    Mistake("feet, one", ("unit", "origin"), scaled(1 / 0.3048, _ONE)),
+    Mistake("feet, one", ("unit",), scaled(1 / 0.3048, _ONE)),
     Mistake("w x y z, one", ("convention", "pose"), of_poses(real_part_first, _ONE)),
     Mistake("height 5 m off, all", ("origin", "actor", "ground"), moved([0, 0, 5])),
     Mistake("clock -1.2 s, one", ("clock",), of_cameras(clock(-1.2), _ONE)),

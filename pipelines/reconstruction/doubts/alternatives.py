@@ -349,7 +349,9 @@ def discrete(trial: Trial) -> Iterator[Alternative]:
         written.setdefault((Path(poses.source).suffix.lower(), poses.topic is None), []).append(index)
     kinds: list[Sequence[int] | None] = [None, *(written.values() if len(written) > 1 else ())]
     conventions = chain.from_iterable(_conventions(trial, kind) for kind in kinds)
-    for row in chain(_mounts(trial), _gimbals(trial), conventions) if trial.moving else ():
+    kinds += [[index] for index in trial.moving if len(trial.moving) > 1 and [index] not in kinds]
+    units = chain.from_iterable(_units(trial, kind) for kind in kinds)
+    for row in chain(_mounts(trial), _gimbals(trial), conventions, units) if trial.moving else ():
         group = trial.moving if row.group is None else row.group
         rotation, position = scene.rotation.copy(), scene.position.copy()
         rotation[group] = row.rotation[group]
@@ -481,7 +483,7 @@ def _frames(body: Float) -> dict[str, Float]:
 
 
 def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
-    """Try other meanings of the logged poses: axes, inverses, orders of quaternions, units.
+    """Try other meanings of the logged poses: axes, inverses, orders of quaternions.
 
     `kind` are the cameras with logs of one kind; None for all that move.
     """
@@ -489,13 +491,7 @@ def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
     price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
     scene, cameras, mounts = trial.described, trial.cameras, trial.mounts
     camera, place = scene.rotation, scene.position
-    body = camera @ mounts.mT
-    on_gimbal = {}
-    for index in moving:
-        own = _body(trial, index)
-        if own is not None:
-            body[index] = own
-            on_gimbal[index] = cameras[index].entry.poses.gimbal
+    body, on_gimbal = _bodies(trial, moving)
 
     def carried_by(bodies: Float) -> Float:
         """Return the attitudes [C, T, 3, 3] of the cameras on bodies that are turned otherwise."""
@@ -559,16 +555,35 @@ def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
         yield Posed(
             code, what, remedy or f"write the log again, since {what}", rotation, position, kind, price
         )
+
+
+def _bodies(trial: Trial, moving: Sequence[int]) -> tuple[Float, dict[int, str | None]]:
+    """Return the attitudes of bodies [C, T, 3, 3], and what gimbals' angles are relative to."""
+    body, on_gimbal = trial.described.rotation @ trial.mounts.mT, {}
+    for index in moving:
+        own = _body(trial, index)
+        if own is not None:
+            body[index] = own
+            on_gimbal[index] = trial.cameras[index].entry.poses.gimbal
+    return body, on_gimbal
+
+
+def _units(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
+    """Try other units of the logged positions, of cameras as in `_conventions`."""
+    moving = trial.moving if kind is None else kind
+    price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
+    camera, place = trial.described.rotation, trial.described.position
+    whose = "" if kind is None else f" of {', '.join(trial.named(kind))}"
     # Lever arms are stated in metres, whatever the log's unit.
-    arms = np.einsum("ctij,cj->cti", body, np.array([each.lever_m for each in cameras]))
+    levers = np.array([each.lever_m for each in trial.cameras])
+    arms = np.einsum("ctij,cj->cti", _bodies(trial, moving)[0], levers)
     for name, metres in _UNITS_M.items():
-        what, again = f"the positions are in {name}", f", and {1 / metres:.4g} times what is read"
+        what, again = f"the positions{whose} are in {name}", f", and {1 / metres:.4g} times what is read"
         for unit, factor, known in ((name, metres, ""), ("m", 1 / metres, again)):
-            shown = what.replace(name, unit) + known
-            remedy = remedies.pose(cameras, moving, f"unit: {unit}")
-            yield Posed(
-                "unit", shown, remedy, camera, (place - arms) * factor + arms, kind, price, same_scatter=True
-            )
+            shown = what.replace(f"in {name}", f"in {unit}") + known
+            remedy = remedies.pose(trial.cameras, moving, f"unit: {unit}")
+            there = (place - arms) * factor + arms
+            yield Posed("unit", shown, remedy, camera, there, kind, price, same_scatter=kind is None)
 
 
 def _keypoints(trial: Trial) -> Iterator[Alternative]:
