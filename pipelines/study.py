@@ -641,11 +641,11 @@ def _by_condition(rows: Sequence[Row]) -> list[list[int]]:
 
 
 def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], cells: Sequence[int]) -> dict[str, Any]:
-    """Mark the best of some cells and the trade-off; return the best and those that are alike."""
+    """Mark the best of some cells and the trade-off; return the best, those alike, and those untold."""
     kept = [k for k in cells if not rows[k]["violations"]] or list(cells)
     best = min(kept, key=lambda k: float(rows[k]["capped_mm"]))
     if len(cells) < 2:
-        return {"cell": best, "cells": list(cells), "alike": []}
+        return {"cell": best, "cells": list(cells), "alike": [], "untold": []}
     rows[best]["best"] = True
 
     def costs(k: int) -> tuple[float, float, float]:
@@ -657,14 +657,15 @@ def _mark_tradeoff(rows: list[dict[str, Any]], capped: Sequence[Any], cells: Seq
             for j in kept
         )
         rows[k]["tradeoff"] = not beaten
-    alike = []
+    alike, untold = [], []
     for k in kept:
         found = mean_of_trials(capped[k] - capped[best])
         if k == best or found is None:
             continue
         if found["mean"] < SMALLEST_DIFFERENCE_MM or (found["interval"] and found["interval"][0] <= 0.0):
             alike.append(k)
-    return {"cell": best, "cells": list(cells), "alike": alike}
+            untold += [k] if found["mean"] >= SMALLEST_DIFFERENCE_MM else []
+    return {"cell": best, "cells": list(cells), "alike": alike, "untold": untold}
 
 
 def _verdict(rows: Sequence[Row], best: Mapping[str, Any]) -> str:
@@ -680,10 +681,14 @@ def _verdict(rows: Sequence[Row], best: Mapping[str, Any]) -> str:
         f" {100 * own['pck150']:.1f}{right} % within 150 mm,"
         f" {own['path_m']:.0f} m and {own['energy_kj']:.0f} kJ of all drones (simulated)"
     ]
-    if best["alike"]:
-        start = "On average no" if "walks" in best else "No"
-        alike = "; ".join(_named(rows[k], group) for k in best["alike"])
-        words.append(f"{start} difference worth flying to {alike}")
+    start = "On average no" if "walks" in best else "No"
+    near = [k for k in best["alike"] if k not in best["untold"]]
+    for said, cells in (
+        (f"{start} difference worth flying to", near),
+        ("Too uncertain to tell it from", best["untold"]),
+    ):
+        if cells:
+            words.append(f"{said} {'; '.join(_named(rows[k], group) for k in cells)}")
     for k in best["cells"] if "walks" in best else ():
         if k != best["cell"]:
             counts = best["walks"][k]
