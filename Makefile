@@ -65,10 +65,12 @@ results: setup
 	$(BIN)/mocap models fetch blazepose
 	$(BIN)/python -m benchmarks.results
 
-# Damaged files and crafted ones into every reader, commands killed at fifty moments, and losses of power, for some minutes each.
+# Damaged files and crafted ones into every reader, attacks by others' sessions, commands killed at fifty
+# moments, and losses of power, for some minutes each.
 fuzz: setup
 	$(BIN)/python -m tests.fuzz --inputs 2000
 	$(BIN)/python -m tests.fuzz --crafted
+	$(BIN)/python -m tests.fuzz --foreign 200
 	$(BIN)/python -m tests.kills --kills 50
 	$(BIN)/python -m tests.kills --power
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m long

@@ -91,9 +91,9 @@ _SHORT_OF_MEMORY = (
 
 
 # Below it, libraries in C++ end the process themselves, with words of their own.
-MIN_ADDRESS_SPACE_BYTES = 700 << 20
+MIN_ADDRESS_SPACE_BYTES = 1000 << 20
 # These commands load more of such libraries.
-LARGE_COMMANDS = {"run", "reconstruct", "replan-compare", "report", "batch"}
+LARGE_COMMANDS = {"run", "check", "reconstruct", "replan-compare", "report", "batch", "simulate", "study"}
 # With less, OpenBLAS or COLMAP ended them in one run of three.
 MIN_ADDRESS_SPACE_OF_LARGE_BYTES = 2000 << 20
 

@@ -58,8 +58,6 @@ def _blocks_of_yaml() -> list[tuple[str, Any]]:
 
 
 # --- commands ------------------------------------------------------------------------------------------
-
-
 def _commands(page: Path) -> Iterator[tuple[str, bool]]:
     """Yield the commands of a page, and False for a span, which may leave out arguments."""
     text = page.read_text(encoding="utf-8")
@@ -128,8 +126,6 @@ def _parse_benchmark(module: str, words: list[str]) -> None:
 
 
 # --- files and links -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("page", _PAGES, ids=lambda page: str(page.relative_to(_ROOT)))
 def test_every_file_of_the_repository_that_is_named_exists(page: Path) -> None:
     for span in _spans(page.read_text(encoding="utf-8")):
@@ -178,8 +174,6 @@ def test_every_script_of_the_pages_can_be_imported(script: Path) -> None:
 
 
 # --- tables, examples, figures ---------------------------------------------------------------------------
-
-
 def test_made_tables_are_current() -> None:
     stale = runpy.run_path(str(_DOCS / "made.py"))["stale"]()
     assert not list(stale), "run python docs/made.py --write"

@@ -35,6 +35,7 @@ from pipelines.session.storage import (
     finished_part,
     hash_of,
     held,
+    is_special,
     jsonable,
     make_folder,
     read_json,
@@ -256,7 +257,7 @@ class Session:
     def _changed(self, record: StageRecord) -> Iterator[Path]:
         for name, expected in record.outputs.items():
             path = self.folder / name
-            if not path.is_file() or sha256_of(path) != expected:
+            if not path.is_file() or is_special(path) or sha256_of(path) != expected:
                 yield path
 
     def ingested(self) -> StageRecord:

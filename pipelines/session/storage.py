@@ -75,21 +75,31 @@ MAX_JSON_BYTES = 1 << 26
 _OF_THE_KERNEL = ("/proc/", "/sys/")
 
 
+# A file of holes takes no place on a disk, and seconds for each gigabyte to read; less is soon read.
+MIN_HOLLOW_BYTES = 1 << 30
+# No compression that file systems use makes a table or film so small.
+MAX_HOLLOW_SHARE = 1e-3
+
+
 def is_special(path: Path) -> bool:
-    """Return True for a pipe, a socket, a device or a file of the kernel, of which reading may never end."""
+    """Return True for what may never end: a pipe, a socket, a device, a file of the kernel or of holes."""
     try:
-        mode = path.stat().st_mode
+        status = path.stat()
         of_kernel = os.path.realpath(path).startswith(_OF_THE_KERNEL)
+        if stat.S_ISREG(status.st_mode) and status.st_size > MIN_HOLLOW_BYTES and hasattr(os, "SEEK_HOLE"):
+            with path.open("rb") as file:  # some file systems count no blocks, but tell no holes either
+                has_hole = os.lseek(file.fileno(), 0, os.SEEK_HOLE) < status.st_size
+            return has_hole and status.st_blocks * 512 < MAX_HOLLOW_SHARE * status.st_size
     except (OSError, ValueError):  # missing, or an impossible name: the function that opens it reports this
         return False
-    return of_kernel or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+    return of_kernel or not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode))
 
 
 def refuse_special(path: Path) -> None:
-    """Refuse, with a DataError, a pipe, a socket or a device."""
+    """Refuse, with a DataError, what `is_special`."""
     if is_special(path):
         remedy = "write what comes out of it to a file, and name that"
-        raise DataError(path, "is a pipe, a socket or a device", remedy, code="special-file")
+        raise DataError(path, "is a pipe, a socket, a device or full of holes", remedy, code="special-file")
 
 
 def text_encoding(content: bytes) -> str:

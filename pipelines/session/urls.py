@@ -42,7 +42,9 @@ MIN_FREE_BYTES_BESIDE_SOURCES = 1 << 30
 
 _URL = re.compile(r"(?is)(?P<scheme>[a-z][a-z0-9+.-]+):(?P<chained>:.*:)?/+(?P<rest>[^/].*)")
 _IPV6 = re.compile(r"(?i)^\[[0-9a-f:.]+\]")
-_SECRET = re.compile(r"(?i)[?&#;][^=&/]*(sig|token|key|secret|credential|passw|pwd|auth)[^=&/]*(=|&|$)")
+_SECRET = re.compile(
+    r"(?i)[?&#;][^=&/]*(sig|token|key|secret|credential|pass|pw|auth|jwt|code|\bsas\b)[^=&/]*(=|&|$)"
+)
 _REFUSED = {"PermissionError", "NoCredentialsError", "PartialCredentialsError", "TokenRetrievalError"}
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 

@@ -1,7 +1,8 @@
 """Reading of users' YAML files: into plain types, and into models with all problems in one message."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_text
+from pipelines.session.urls import url_of
 from pipelines.session.yaml_models import YamlModel, describe_problem
 
 # A real file has a few thousand bytes, and a parser of YAML needs seconds for a million.
@@ -22,6 +24,8 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
     """Read and validate a file; one DataError holds every problem that was found."""
     how = f" ({made})" if made else ""
     raw = plain_yaml(path, read_text(path, most_bytes=MAX_FILE_BYTES))
+    for text in [value for value, _ in _values(path, raw) if isinstance(value, str)]:
+        url_of(text)  # before any message repeats a secret in it
     if not isinstance(raw, Mapping):
         raise DataError(path, f"is no {noun}", f"it must be {shape}{how}", code="wrong-kind")
     if isinstance(raw.get("schema"), int) and raw["schema"] > newest:
@@ -57,7 +61,7 @@ MAX_INTEGER_BITS = 1024
 # The parser reads 10,000 to 20,000 values in a second.
 MAX_MARKS = 30_000
 
-# Merges of merges copy entries without end; no file of a user has so many.
+# Merges of merges, and aliases, repeat entries without end; no file of a user has so many.
 MAX_MERGED_ENTRIES = 100_000
 
 
@@ -100,23 +104,29 @@ def plain_yaml(path: Path, text: str) -> object:
 
 def _refuse_impossible_values(path: Path, value: object) -> None:
     """Refuse integers beyond any float, and texts with characters that no file name can hold."""
-    seen: set[int] = set()  # an aliased value is one object, however often it is used
+    for item, place in _values(path, value):
+        if isinstance(item, str) and _IMPOSSIBLE.search(item):
+            raise _impossible(path, place, f"holds a text with impossible characters ({item[:60]!r})")
+        if isinstance(item, int) and item.bit_length() >= MAX_INTEGER_BITS:
+            digits = item.bit_length() * 3 // 10
+            raise _impossible(path, place, f"holds an integer of about {digits} digits")
+
+
+def _values(path: Path, value: object) -> Iterator[tuple[object, tuple[object, ...]]]:
+    """Yield all keys and values with their places; an aliased value each time that it is used."""
     waiting: list[tuple[object, tuple[object, ...]]] = [(value, ())]
-    while waiting:
+    for visited in count():
+        if not waiting:
+            return
+        if visited > MAX_MERGED_ENTRIES:  # an alias of what it is within repeats it without end
+            raise DataError(path, "repeats values without end (&, *)", "mend it", code="too-large")
         item, place = waiting.pop()
-        if id(item) in seen:
-            continue
-        seen.add(id(item))
+        yield item, place
         if isinstance(item, Mapping):
             waiting += [(part, (*place, key)) for key, part in item.items()]
             waiting += [(key, place) for key in item]  # last, so keys are checked before they name places
         elif isinstance(item, list | tuple):  # a tuple is a key
             waiting += [(part, (*place, index)) for index, part in enumerate(item)]
-        elif isinstance(item, str) and _IMPOSSIBLE.search(item):
-            raise _impossible(path, place, f"holds a text with impossible characters ({item[:60]!r})")
-        elif isinstance(item, int) and item.bit_length() >= MAX_INTEGER_BITS:
-            digits = item.bit_length() * 3 // 10
-            raise _impossible(path, place, f"holds an integer of about {digits} digits")
 
 
 def _impossible(path: Path, place: tuple[object, ...], problem: str) -> DataError:

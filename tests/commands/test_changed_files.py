@@ -16,7 +16,6 @@ from pipelines.film import film
 from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.report import compare_sessions
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
 from pipelines.session.stages import COMMANDS
@@ -61,9 +60,6 @@ def again(flight: Path, *options: str) -> list[str | Path]:
 
 def stages_run(session: Path) -> list[str]:
     return [run["stage"] for run in read_json(session / "run.json")["runs"]]
-
-
-# --- sources --------------------------------------------------------------------------------------------
 
 
 def test_an_exchanged_video_is_refused_until_it_is_ingested_and_its_keypoints_go(
@@ -172,7 +168,12 @@ def exchange(session: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [("report", "--force", "--figures", "figures"), ("export", "--to", "mcap", "-o", "exported")]
+    "command",
+    [
+        ("report", "--force", "--figures", "figures"),
+        ("export", "--to", "mcap", "-o", "exported"),
+        ("reconstruct", "--force"),
+    ],
 )
 def test_every_command_that_reads_pictures_refuses_others(
     filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
@@ -190,15 +191,6 @@ def test_every_command_that_reads_pictures_refuses_others(
     # What reads no pictures goes on.
     assert "unchanged" in succeeds("reconstruct", session, "--method", "robust")
     assert "written" in succeeds("export", session, "--to", "csv", "-o", tmp_path / "csv")
-
-
-def test_reconstruct_refuses_another_video_beside_imported_keypoints(filmed: Path, tmp_path: Path) -> None:
-    session = copied(filmed, tmp_path)
-    before = content(session)
-    exchange(session)
-    line = refused("reconstruct", session, "--force", code="changed")
-    assert str(session.parent / "drone1.mp4") in line
-    assert content(session) == before
 
 
 def test_a_source_that_is_written_while_it_is_ingested_is_refused(tmp_path: Path) -> None:
@@ -220,9 +212,6 @@ def test_a_source_that_is_written_while_it_is_ingested_is_refused(tmp_path: Path
     assert not ingest(flight.manifest, session).skipped
 
 
-# --- tables ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a reconstructed session with imported keypoints, and videos beside it."""
@@ -242,35 +231,6 @@ def shift(table: Path) -> None:
     frame = pd.read_parquet(table)
     frame["x"] += 0.5
     frame.to_parquet(table, index=False)
-
-
-@pytest.mark.parametrize("change", [shift, Path.unlink])
-def test_a_changed_table_of_ingest_is_refused_by_all_until_ingest_makes_it_anew(
-    filmed: Path, tmp_path: Path, change: Callable[[Path], None]
-) -> None:
-    session = copied(filmed, tmp_path)
-    manifest = session.parent / "flight.yaml"
-    before = content(session)
-    table = session / "cameras" / "drone2" / "poses.parquet"
-    change(table)
-    changed = content(session)
-    for command in (
-        ("reconstruct",),
-        ("reconstruct", "--force"),
-        ("reconstruct", "--method", "dlt"),
-        ("replan-compare",),
-        ("report",),
-        ("export", "--to", "tum", "-o", tmp_path / "exported"),
-    ):
-        line = refused(command[0], session, *command[1:])
-        assert str(table) in line
-        assert COMMANDS["ingest"] in line
-    with pytest.raises(DataError, match=r"poses\.parquet"):
-        compare_sessions([filmed / "flight.session", session], tmp_path / "compared.html")
-    assert content(session) == changed
-    assert "written" in succeeds("ingest", manifest)
-    assert content(session) == before
-    assert "unchanged" in succeeds("reconstruct", session, "--method", "robust")
 
 
 def test_a_changed_replay_is_neither_shown_nor_filmed(tmp_path: Path) -> None:
@@ -302,9 +262,6 @@ def test_tables_that_no_stage_wrote_are_not_read(filmed: Path, tmp_path: Path) -
     assert recording.refined == {}
     assert list(recording.maps()) == []
     export(session, ["mcap"], tmp_path / "exported", pictures_hz=0)
-
-
-# --- force ----------------------------------------------------------------------------------------------
 
 
 def test_force_makes_all_that_the_command_makes(flight: Path) -> None:

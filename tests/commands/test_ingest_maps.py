@@ -138,7 +138,6 @@ def test_truncated_maps_are_counted_or_refused(tmp_path: Path) -> None:
 
 
 # --- real recordings -----------------------------------------------------------------------------------
-
 HUSKY = "logs/ros1/husky_gps_imu_odom.bag"
 
 

@@ -198,8 +198,6 @@ def test_names_hostile_to_yaml_stay_names(tmp_path: Path, name: str) -> None:
 
 
 # --- where things lie ----------------------------------------------------------------------------------
-
-
 def test_paths_are_relative_to_the_manifest_wherever_it_lies(tmp_path: Path) -> None:
     write_flight(tmp_path / "flight", static=True).manifest.unlink()
     (tmp_path / "manifests").mkdir()
@@ -286,8 +284,6 @@ def test_transforms_of_a_camera_are_named_by_their_frames(tmp_path: Path) -> Non
 
 
 # --- real recordings -----------------------------------------------------------------------------------
-
-
 def test_a_real_recording_of_four_cameras_needs_nothing_more(tmp_path: Path) -> None:
     recording = real_data("pose2sim_single")
     result = draft([recording], tmp_path / "flight.yaml")

@@ -5,8 +5,6 @@ import os
 import re
 import shutil
 import signal
-import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,6 @@ import pytest
 from pipelines.geometry.cameras import project
 from pipelines.session.description import read_description
 from pipelines.session.registries import FORMATS
-from pipelines.session.stages import COMMANDS
 from pipelines.session.storage import read_json
 from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
@@ -228,29 +225,6 @@ def test_when_nothing_is_reconstructed_the_gate_is_named(tmp_path: Path) -> None
     assert not (tmp_path / "flight.session" / "reconstruct").exists()
 
 
-def test_hostile_names_do_not_reach_the_terminal(tmp_path: Path) -> None:
-    path = tmp_path / "evil\x1b[31m\nname.yaml"
-    path.write_text("schema: 1\ncameras: 3\n", encoding="utf-8")
-    line = refused("ingest", path)
-    assert "\x1b" not in line
-
-
-@pytest.mark.parametrize("command", ["reconstruct", "report"])
-def test_folder_that_is_no_session(tmp_path: Path, command: str) -> None:
-    line = refused(command, tmp_path)
-    assert line.startswith(f"mocap: {tmp_path}: ")
-    assert COMMANDS["ingest"] in line
-
-
-def test_target_that_holds_something_else_is_refused(flight: SyntheticFlight, tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "thesis.tex").write_text("years", encoding="utf-8")
-    assert "--overwrite" in refused("ingest", flight.manifest, "-o", other)
-    succeeds("ingest", flight.manifest, "-o", other, "--overwrite")
-    assert (other / "thesis.tex").read_text(encoding="utf-8") == "years"
-
-
 def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFlight, tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
     before = content(tmp_path / "flight.session")
@@ -260,71 +234,11 @@ def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFli
     assert content(tmp_path / "flight.session") == before
 
 
-HUGE = "0x" + "f" * 5000  # Python refuses to print it
-
-
-NUMBERS = [
-    ("fps: 30", 'fps: "1e99999999"', "frame_times.fps"),
-    ("start: 1700000000.0", 'start: "1e999980"', "frame_times.start"),
-    ("schema: 1", f"schema: {HUGE}", "schema"),
-    ("schema: 1", f"schema: 1\n? [{HUGE}]\n: 1", "an integer of about 6000 digits"),
-    ("file: k.json", f"file: k.json, first_frame: {10**30}", "keypoints.first_frame"),
-]
-
-
-def test_numbers_beyond_all_bounds(tmp_path: Path) -> None:
-    text = (
-        "schema: 1\ncameras: {d: {frame_times: {start: 1700000000.0, fps: 30}, pose: {file: a.tum},"
-        " intrinsics: i.yaml, keypoints: {file: k.json}}}\n"
-    )
-    paths = [tmp_path / f"{number}.yaml" for number in range(len(NUMBERS))]
-    for path, (old, new, _) in zip(paths, NUMBERS, strict=True):
-        path.write_text(text.replace(old, new), encoding="utf-8")
-    # In a process of its own: an endless computation must not block the other tests.
-    done = mocap_process("ingest", *paths, timeout=60)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    for path, (_, _, place) in zip(paths, NUMBERS, strict=True):
-        (line,) = [line for line in done.stderr.splitlines() if line.startswith(f"mocap: {path}: ")]
-        assert place in line
-
-
-@pytest.fixture
-def no_waiting() -> Iterator[None]:
-    """Fail a test that waits for a minute."""
-
-    def waited(*_: object) -> None:
-        pytest.fail("waited for a pipe")
-
-    before = signal.signal(signal.SIGALRM, waited)
-    signal.alarm(60)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
-
-
-@pytest.mark.usefixtures("no_waiting")
-def test_pipes_and_sockets_are_refused_and_not_waited_for(flight: SyntheticFlight, tmp_path: Path) -> None:
-    folder = tmp_path / "pipes"
-    folder.mkdir()
-    for suffix, commands in {".yaml": ("info", "ingest"), ".csv": ("info",), ".mcap": ("init",)}.items():
-        pipe = folder / f"pipe{suffix}"
-        os.mkfifo(pipe)
-        for command in commands:
-            assert re.search(rf"/{pipe.name}: .*\bpipe\b", refused(command, pipe))
-    flight.settings["cameras"]["drone1"]["pose"]["file"] = "pipes/pipe.csv"
-    flight.save()
-    assert "pipe.csv: is a pipe" in refused("ingest", flight.manifest)
-    with socket.socket(socket.AF_UNIX) as listening:
-        listening.bind(os.path.relpath(folder / "s.srt"))  # names of sockets are short
-        assert "s.srt: is a pipe, a socket " in refused("info", folder / "s.srt")
-    assert refused("info", "/dev/null").startswith("mocap: /dev/null: is a pipe")
-
-
-@pytest.mark.usefixtures("no_waiting")
 def test_no_format_opens_a_pipe(tmp_path: Path) -> None:
+    signal.alarm(60)  # it would wait without end
     suffixes = sorted({suffix for format_ in FORMATS.all() for suffix in getattr(format_, "suffixes", ())})
     pipes = [tmp_path / f"pipe{suffix}" for suffix in suffixes]
     for pipe in pipes:
         os.mkfifo(pipe)
     assert not [pipe for pipe in pipes if any(each.recognises(pipe) for each in FORMATS.all())]
+    signal.alarm(0)

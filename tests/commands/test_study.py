@@ -191,8 +191,6 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
 
 
 # --- sessions ------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def calm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     noisy = CALM + "  pose_noise: {white: {position_m: 0.02, rotation_deg: 0.5}}\n"

@@ -13,19 +13,28 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from tests.fuzz.crafted import Crafted
 
 MOST_S = 10.0
 MOST_MB = 1000
 _END_S = 15  # of processor time: an input that needs more is ended
+_COMPUTING_END_S = 60  # of processor time: a command that needs more is ended
 _WAIT_S = 300.0
 _MOST_ADDRESSES = 16 << 30  # bytes: a reader that asks for more gets an error, and the machine goes on
 _MOST_FILE = 4 << 30  # bytes
+_CHANGES = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "shutil.rmtree", "shutil.copytree"}
+_LEFT_OUT = {  # as in tests/commands: half of the time of reconstructing and of drawing pages
+    "pipelines.reconstruct.doubts_of": lambda *_, **__: [],
+    "pipelines.reporting.chart._inline_svg": lambda *_: "<svg></svg>",
+}
 
 
 @dataclass(frozen=True)
@@ -50,10 +59,18 @@ def attack(inputs: Iterable[Crafted], folder: Path) -> Iterator[Met]:
         for crafted in inputs:
             place.mkdir()
             crafted.write(place)
-            size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
-            answer = reader.ask(place / crafted.entry, crafted.stated)
+            yield reader.met(crafted.kind, crafted.what, place / crafted.entry, crafted.stated)
             shutil.rmtree(place)
-            yield Met(crafted.kind, crafted.what, size, **answer)
+
+
+@dataclass(frozen=True)
+class Command:
+    """`mocap` command; what it prints goes to the files `printed` and `told` of its folder."""
+
+    arguments: Sequence[str]
+    most_mb: int | None = None  # of addresses: with a limit it is a process that loads everything itself
+    public: str = ""  # an address of this machine that stands for one of the Internet
+    touched: str = ""  # a file for the names of all that it opens to write, makes, moves and removes
 
 
 class Reader:
@@ -82,10 +99,21 @@ class Reader:
         self._process.kill()
         self._process.communicate()
 
-    def ask(self, path: Path, stated: str) -> dict[str, Any]:
+    def met(self, kind: str, what: str, path: Path, stated: str) -> Met:
+        """Read an input, alone in its folder."""
+        size = sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+        answer = self.ask(path, stated)
+        del answer["status"]
+        return Met(kind, what, size, **answer)
+
+    def ask(
+        self, path: Path, stated: str, command: Command | None = None, *, most_s: float = MOST_S
+    ) -> dict[str, Any]:
+        """Read an input, or run a command in a folder; return what `Met` says, or the command's `status`."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps([str(path), stated]) + "\n")
+        asked = [str(path), stated, None if command is None else asdict(command), most_s]
+        self._process.stdin.write(json.dumps(asked) + "\n")
         self._process.stdin.flush()
         answer: dict[str, Any] = json.loads(self._process.stdout.readline())
         return answer
@@ -102,25 +130,28 @@ def main() -> None:
     for path, stated in json.loads(sys.stdin.readline()):
         read_or_refuse(Path(path), stated)
     for line in sys.stdin:
-        path, stated = json.loads(line)
-        print(json.dumps(_measured(Path(path), stated)), file=answers, flush=True)
+        path, stated, command, most_s = json.loads(line)
+        child = partial(_run_as_child, Path(path), Command(**command)) if command else None
+        done = _measured(child or partial(_read_as_child, Path(path), stated), most_s)
+        print(json.dumps(done), file=answers, flush=True)
 
 
-def _measured(path: Path, stated: str) -> dict[str, object]:
-    """Read in a child; return time, memory and outcome."""
+def _measured(act: Callable[[int], None], most_s: float) -> dict[str, object]:
+    """Act in a child, which gets a pipe for its answer; return time, memory and outcome."""
     out, into = os.pipe()
     child = os.fork()
     if not child:
         os.close(out)
-        _read_as_child(path, stated, into)
+        act(into)
     os.close(into)
     said = _all_of(out, child)
     _, status, used = os.wait4(child, 0)
-    found: dict[str, Any] = {"read": 0, "refused": 0, "trouble": "", "line": ""}
-    found |= json.loads(said) if said else {"trouble": f"ended by signal {os.waitstatus_to_exitcode(status)}"}
+    ended = os.waitstatus_to_exitcode(status)
+    found: dict[str, Any] = {"read": 0, "refused": 0, "trouble": "", "line": "", "status": ended}
+    found |= json.loads(said) if said else {"trouble": f"ended by signal {-ended}" if ended < 0 else ""}
     cpu_s, mb = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
-    if not found["trouble"] and (cpu_s > MOST_S or mb > MOST_MB):
-        found["trouble"] = "too slow" if cpu_s > MOST_S else "too large"
+    if not found["trouble"] and (cpu_s > most_s or mb > MOST_MB):
+        found["trouble"] = "too slow" if cpu_s > most_s else "too large"
     return {"cpu_s": cpu_s, "mb": mb, **found}
 
 
@@ -152,6 +183,52 @@ def _read_as_child(path: Path, stated: str, into: int) -> None:
         answer = {"trouble": traceback.format_exc()}
     os.write(into, json.dumps(answer).encode())
     os._exit(0)
+
+
+def _run_as_child(folder: Path, command: Command, into: int) -> None:
+    """Run a command as its process would; the pipe is open until it ends."""
+    from mocap_cli.main import run
+    from pipelines.session import urls
+    from tests.commands.runner import MOCAP
+
+    for number, name in enumerate((os.devnull, "printed", "told")):
+        os.dup2(os.open(folder / name, os.O_RDWR | os.O_CREAT | os.O_TRUNC), number)
+    os.chdir(folder)
+    os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
+    sys.argv = [MOCAP, *command.arguments]
+    resource.setrlimit(resource.RLIMIT_CPU, (_COMPUTING_END_S, _COMPUTING_END_S))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (_MOST_FILE, _MOST_FILE))
+    if command.most_mb is not None:
+        os.set_inheritable(into, True)
+        resource.setrlimit(resource.RLIMIT_AS, (command.most_mb << 20, command.most_mb << 20))
+        os.execv(MOCAP, sys.argv)  # noqa: S606
+    resource.setrlimit(resource.RLIMIT_AS, (_MOST_ADDRESSES, _MOST_ADDRESSES))
+    public = urls.is_public
+    status: object = 1
+    touched = set[str]()
+
+    def note(event: str, given: tuple[Any, ...]) -> None:
+        if event in _CHANGES and (event != "open" or (given[2] or 0) & (os.O_WRONLY | os.O_RDWR)):
+            touched.update(str(path) for path in given[:2] if isinstance(path, str | Path))
+
+    if command.touched:
+        sys.addaudithook(note)
+    try:
+        with ExitStack() as stack:
+            for place, instead in _LEFT_OUT.items():
+                stack.enter_context(patch(place, instead))
+            seems_public = lambda address: address == command.public or public(address)  # noqa: E731
+            stack.enter_context(patch.object(urls, "is_public", seems_public))
+            run()
+    except SystemExit as ended:
+        status = ended.code
+    except BaseException:
+        traceback.print_exc()
+    if command.touched:
+        Path(command.touched).write_text("\n".join(sorted(touched)), encoding="utf-8")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status if isinstance(status, int) else 1)
 
 
 if __name__ == "__main__":

@@ -75,8 +75,6 @@ def _writer(entry: str, content: bytes | str) -> Writer:
     return lambda folder: (folder / entry).write_bytes(data)
 
 
-# --- MCAP ----------------------------------------
-
 _MCAP = b"\x89MCAP0\r\n"
 
 
@@ -190,9 +188,6 @@ def _varint(value: int) -> bytes:
     return bytes([*found, value])
 
 
-# --- ROS bags ----------------------------------------
-
-
 def _bag_record(fields: dict[str, bytes], data: bytes = b"") -> bytes:
     parts = [name.encode() + b"=" + value for name, value in fields.items()]
     header = b"".join(struct.pack("<I", len(part)) + part for part in parts)
@@ -301,9 +296,6 @@ def _bag_folders() -> Iterator[_Input]:
     yield "a zstd file of 4 GB", bag(stated, a__db3__zstd=bomb)
 
 
-# --- YAML, TOML, XML ----------------------------------------
-
-
 def _laughs(levels: int = 9, each: int = 9) -> str:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * each)}]" for k in range(1, levels + 1)]
@@ -342,9 +334,6 @@ def _toml() -> Iterator[_Input]:
     yield "an INI of 200,000 keys", "camera_info", "left.ini", "[image]\n" + keys
 
 
-# --- keypoints ----------------------------------------
-
-
 @_kind("keypoints: frame numbers", "coco", "a.json")
 def _frame_numbers() -> Iterator[_Input]:
     def person(image: object) -> dict[str, object]:
@@ -381,9 +370,6 @@ def _keypoint_json() -> Iterator[_Input]:
     yield "10,000 files without people", "openpose", "drone", folder
 
 
-# --- text tables ----------------------------------------
-
-
 @_kind("text tables", "joints_csv", "joints.csv")
 def _tables() -> Iterator[_Input]:
     row = "1700000000.0 0 0 0 0 0 0 1\n"
@@ -410,9 +396,6 @@ def _bvh() -> Iterator[_Input]:
     deep = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\n" for k in range(n)) + "}\n" * (n + 1)
     yield "nested 50,000 deep", motion(root + deep, 3)
     yield "10^9 frames stated", motion(root + "}\n", 3).replace("Frames: 1", "Frames: 1000000000")
-
-
-# --- maps ----------------------------------------
 
 
 @_kind("maps: point clouds", "pcd", "a.pcd")
@@ -488,9 +471,6 @@ def _png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", data) + part(b"IEND", b"")
 
 
-# --- pictures, videos ----------------------------------------
-
-
 @_kind("pictures", "pictures", "film")
 def _pictures() -> Iterator[_Input]:
     def film(content: bytes, suffix: str = "png") -> Writer:
@@ -536,9 +516,6 @@ def _boxes() -> Iterator[_Input]:
     yield "boxes nested deep", head + nested
     yield "200,000 empty boxes", head + b"\0\0\0\x08free" * 200_000
     yield "a box of no length", head + bytes(4) + b"moov" + bytes(100)
-
-
-# --- telemetry ----------------------------------------
 
 
 @_kind("PX4 logs", "ulog", "a.ulg")

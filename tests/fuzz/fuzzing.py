@@ -2,57 +2,31 @@
 
 import random
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from tests.fuzz.attacking import Reader
+from tests.fuzz.attacking import Met, Reader
 from tests.fuzz.mutations import damage_one
 from tests.fuzz.seeds import HEADS, SEEDS, sown
 
 
-@dataclass(frozen=True)
-class Trouble:
-    """Input that was neither read nor refused."""
-
-    seed: str
-    number: int
-    file: str
-    what: str
-
-
-@dataclass(frozen=True)
-class Fuzzed:
-    """Results of all inputs."""
-
-    inputs: int
-    read: int  # ways in which inputs were read
-    refused: int
-    troubles: list[Trouble]
-
-
-def fuzz(folder: Path, inputs: int, *, seed: int = 0, names: Sequence[str] | None = None) -> Fuzzed:
+def fuzz(folder: Path, inputs: int, *, seed: int = 0, names: Sequence[str] | None = None) -> Iterator[Met]:
     """Read damaged copies of the seeds (all by default), the same number of each, in an empty folder.
 
     Inputs that made trouble stay below `trouble/`; input k does not depend on the number of inputs.
     """
     chosen = list(names or SEEDS)
     sources = sown(folder / "seeds", chosen)
-    read = refused = 0
-    troubles = []
     with Reader([(str(sources[name]), format_of(name)) for name in chosen]) as reader:
         for number in range(inputs):
             name = chosen[number % len(chosen)]
             place = folder / "input"
             copy, file = _damaged_copy(sources[name], place, random.Random(f"{seed} {number}"))  # noqa: S311
-            answer = reader.ask(copy, format_of(name))
-            read += answer["read"]
-            refused += answer["refused"]
-            if answer["trouble"]:
-                troubles.append(Trouble(name, number, file, answer["trouble"]))
+            met = reader.met(name, f"{number}: {file}", copy, format_of(name))
+            if met.trouble:
                 shutil.copytree(place, folder / "trouble" / f"{number}", dirs_exist_ok=True)
             shutil.rmtree(place)
-    return Fuzzed(inputs, read, refused, troubles)
+            yield met
 
 
 def format_of(name: str) -> str:

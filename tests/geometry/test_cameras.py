@@ -266,8 +266,6 @@ def same_rotation(a: Float, b: Float) -> None:
 
 
 # --- the worked example --------------------------------------------------------------------------------
-
-
 def test_paper_case_1_fixed_mount() -> None:
     camera = compose(LEVEL, (LEVER_ARM, body_from_camera("forward", 30)))
     assert f"= {on_paper(camera[0])}\n\nThe optical axis" in PAPER
@@ -296,8 +294,6 @@ def test_paper_case_3_gimbal_on_the_body() -> None:
 
 
 # --- axis by axis --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("looks", "axis", "top"),
     [
@@ -355,8 +351,6 @@ def test_dji_angles_in_the_world(angles: tuple[float, float, float], axis: Float
 
 
 # --- algebra -------------------------------------------------------------------------------------------
-
-
 @given(angles_deg)
 def test_angles_agree_with_scipy_whatever_their_order_and_unit(angles: Float) -> None:
     expected = Rotation.from_euler("ZYX", angles, degrees=True).as_quat()

@@ -174,7 +174,6 @@ def test_feet_that_stand_slide_as_far_as_the_estimate_moves_them() -> None:
 
 
 # --- without truth -------------------------------------------------------------------------------------
-
 BONES = (("left_hip", "left_knee"), ("right_hip", "right_knee"), ("left_hip", "right_hip"))
 
 

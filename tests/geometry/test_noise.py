@@ -145,8 +145,6 @@ def test_latency_shows_where_the_camera_was() -> None:
 
 
 # --- from what users write -----------------------------------------------------------------------------
-
-
 def test_a_flight_s_pose_noise_becomes_models() -> None:
     pose_noise: dict[str, dict[str, object]] = {
         "white": {"position_m": 0.1, "rotation_deg": 0.5},

@@ -60,8 +60,6 @@ def log_at(t_ns: Int64) -> tuple[Float, Float]:
 
 
 # --- rotations -----------------------------------------------------------------------------------------
-
-
 def test_matrices_are_scipy_s() -> None:
     quaternions = random_quaternions(50)
     expected = Rotation.from_quat(quaternions).as_matrix()
@@ -89,8 +87,6 @@ def test_multiplying_applies_the_right_one_first(a: Float, b: Float, vector: Flo
 
 
 # --- chains --------------------------------------------------------------------------------------------
-
-
 @given(vectors, rotation_vectors, vectors, rotation_vectors, vectors)
 def test_chains_of_transforms(p: Float, r: Float, q: Float, s: Float, point: Float) -> None:
     world_from_a = (p, quaternion_from_rotation_vector(r))
@@ -108,8 +104,6 @@ def test_chains_of_transforms(p: Float, r: Float, q: Float, s: Float, point: Flo
 
 
 # --- time ----------------------------------------------------------------------------------------------
-
-
 def test_constant_motion_is_interpolated_exactly() -> None:
     t_ns = EPOCH + np.array([0, 90, 200, 310, 400], dtype=np.int64) * MS
     position, quaternion = log_at(t_ns)

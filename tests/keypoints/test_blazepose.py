@@ -275,7 +275,6 @@ def test_damaged_and_wrong_sources_are_named(shelf: Path, tmp_path: Path) -> Non
 
 
 # --- out of a tarball, by npm --------------------------------------------------------------------------
-
 TARBALL = "mocap-test-models-1.2.0.tgz"
 NETWORK = {"package/third.tflite": b"third network" * 300}
 

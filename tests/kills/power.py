@@ -46,7 +46,6 @@ class Moment:
 
 
 # --- recording -----------------------------------------------------------------------------------------
-
 _CHANGING = ("rename", "replace", "remove", "unlink", "mkdir", "rmdir", "link", "truncate", "ftruncate")
 _SYNCING = ("fsync", "fdatasync")
 
@@ -130,8 +129,6 @@ class Recorder:
 
 
 # --- what may be left ----------------------------------------------------------------------------------
-
-
 def losses(
     trace: Sequence[Moment], choice: np.random.Generator, *, moments: int
 ) -> Iterator[tuple[int, Disk]]:
@@ -177,8 +174,6 @@ def write_disk(disk: Disk, folder: Path) -> None:
 
 
 # --- commands ------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Case:
     """Command that is recorded, with what was there before it."""

@@ -43,8 +43,6 @@ CHI2_95 = 7.8147  # of the chi-square distribution with three degrees of freedom
 
 
 # --- derivatives ---------------------------------------------------------------------------------------
-
-
 # Helpers can be called by compiled functions alone.
 linearise = numba.njit(lambda *arguments: kernels.linearise(*arguments))  # noqa: PLW0108
 
@@ -84,8 +82,6 @@ def test_derivatives_are_those_of_finite_differences(angle: float) -> None:
 
 
 # --- equations -----------------------------------------------------------------------------------------
-
-
 def small_system(*, exact: bool, times: int = 5, knots: int = 3) -> tuple[System, State]:
     """Build a system with few times, three joints, two cameras with every kind of unknown.
 
@@ -164,8 +160,6 @@ def test_long_flights_are_factorised_in_segments_with_the_same_result(
 
 
 # --- results -------------------------------------------------------------------------------------------
-
-
 def refined(flight: Formation, models: list[NoiseModel] | None) -> tuple[Float, Float, str | None]:
     prior = None if models is None else [pose_errors(models)] * len(flight.sightings)
     result = refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(len(flight.sightings)))

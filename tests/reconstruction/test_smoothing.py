@@ -29,8 +29,6 @@ def one_joint(values: Float) -> Float:
 
 
 # --- butterworth ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_the_gain_is_that_of_two_passes_and_nothing_lags(order: int) -> None:
     """Filter sines at 2, 6 (the cutoff: -3 dB of both passes together) and 12 Hz, one on each axis."""
@@ -89,8 +87,6 @@ def test_a_filter_needs_an_even_rate_and_a_cutoff_below_half_of_it() -> None:
 
 
 # --- what users write ----------------------------------------------------------------------------------
-
-
 def test_texts_become_smoothers() -> None:
     assert smoother(None) is None
     assert smoother("butterworth") == Butterworth(6.0, 4)

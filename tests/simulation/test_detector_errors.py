@@ -61,8 +61,6 @@ def lengths(xy: Float) -> Float:
 
 
 # --- errors --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("tilt_deg", "median_share"), [(15.0, 0.0192), (60.0, 0.0407), (52.5, 0.03545)])
 @pytest.mark.parametrize("scale", [1.0, 2.5])
 def test_errors_have_the_measured_median(tilt_deg: float, median_share: float, scale: float) -> None:
@@ -120,8 +118,6 @@ def test_hidden_joints_are_mostly_missed_and_else_bad() -> None:
 
 
 # --- swaps ---------------------------------------------------------------------------------------------
-
-
 def test_a_swap_exchanges_one_pair_of_limbs_for_a_few_frames() -> None:
     """The same draws with and without swaps differ by exactly that."""
     swaps = DetectorErrors(missed_share=0.05, outlier_share=0.02, swap_share=0.1)
@@ -143,8 +139,6 @@ def test_a_swap_exchanges_one_pair_of_limbs_for_a_few_frames() -> None:
 
 
 # --- confidence ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("tilt_deg", "mean"), [(15.0, 0.89), (60.0, 0.74)])
 def test_confidence_has_the_measured_mean_and_falls_with_the_error(tilt_deg: float, mean: float) -> None:
     """Confidences are capped at 1, which takes E[max(N(0, .05) - .04, 0)] = 0.006 of the surest at most."""

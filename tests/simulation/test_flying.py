@@ -47,8 +47,6 @@ def angle_deg(one: Float, other: Float) -> Float:
 
 
 # --- tracking ------------------------------------------------------------------------------------------
-
-
 def test_behind_a_circling_slot_a_drone_lags_as_its_loops_say() -> None:
     """The slot's path s and the error e obey lag e''' + e'' + kv e' + kv kp e = lag s''' + s''.
 
@@ -86,8 +84,6 @@ def test_limits_are_never_exceeded(seed: int) -> None:
 
 
 # --- a planner on the way ------------------------------------------------------------------------------
-
-
 def test_a_planner_knows_the_past_alone() -> None:
     actor_t_s = np.arange(0.05, 2.0, 0.1)
     actor = np.random.default_rng(2).normal(size=(len(actor_t_s), 3))
@@ -114,8 +110,6 @@ def test_a_planner_knows_the_past_alone() -> None:
 
 
 # --- attitudes -----------------------------------------------------------------------------------------
-
-
 def test_cameras_look_at_their_aim_and_stand_upright() -> None:
     """Seen from the camera the aim turns with the ring; the gimbal lags by that rate times its lag."""
     paths = circling()

@@ -39,8 +39,6 @@ def generator(seed: int = 0) -> np.random.Generator:
 
 
 # --- stamps --------------------------------------------------------------------------------------------
-
-
 def test_frames_are_even_but_for_those_that_were_lost() -> None:
     """10,000 frames: the standard error of a share of 0.2 is 0.4 %."""
     lens = Lens(rate_hz=30, dropped_share=0.2)
@@ -55,8 +53,6 @@ def test_frames_are_even_but_for_those_that_were_lost() -> None:
 
 
 # --- true poses ----------------------------------------------------------------------------------------
-
-
 def test_between_moments_poses_go_on_smoothly() -> None:
     """From every fifth moment (0.05 s), the others come out: a cubic errs by jerk h^3 / 100, attitudes
     by their angular acceleration h^2 / 8. While circling both are below 4 m/s^3 and 1 rad/s^2.
@@ -81,8 +77,6 @@ def test_between_moments_poses_go_on_smoothly() -> None:
 
 
 # --- estimated poses -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("models", [[], [White(position_m=0.3, rotation_deg=1.0)]])
 def test_body_and_gimbal_make_the_camera(models: list[NoiseModel]) -> None:
     """As ingest composes them: the camera of the log, which is the true one without noise."""

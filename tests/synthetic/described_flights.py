@@ -171,8 +171,6 @@ class Described:
 
 
 # --- mistakes: each changes the poses that are written, the keypoints, or the manifest --------------------
-
-
 @dataclass
 class Mistaken:
     """A description that a mistake changes in place."""
@@ -498,8 +496,6 @@ LESS_USUAL = [
 
 
 # --- measuring ---------------------------------------------------------------------------------------------
-
-
 def mistaken(described: Described, change: Change | None) -> Path:
     """Write the flight with a mistake, or right."""
     description = Mistaken(

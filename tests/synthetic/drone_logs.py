@@ -84,8 +84,6 @@ def angles_of(ahead: Float, right: Float) -> Float:
 
 
 # --- DJI's subtitles -----------------------------------------------------------------------------------
-
-
 def write_srt(path: Path, truth: DroneTruth, *, gimbal: bool = True, newline: str = "\n") -> Path:
     """Write subtitles of each frame in the form since 2018, with more decimals than drones."""
     blocks = []
@@ -139,7 +137,6 @@ def write_record(path: Path, truth: DroneTruth) -> Path:
 
 
 # --- DataFlash -----------------------------------------------------------------------------------------
-
 DATAFLASH = {
     "FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"),
     "GPS": (8, "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
@@ -205,7 +202,6 @@ def write_dataflash(
 
 
 # --- MAVLink of ground stations ------------------------------------------------------------------------
-
 # Number, checksum's extra byte and layout of each message (common.xml).
 MAVLINK = {
     "SYSTEM_TIME": (2, 137, "<QI"),
@@ -290,7 +286,6 @@ def tlog_pictures(
 
 
 # --- ULog ----------------------------------------------------------------------------------------------
-
 ULOG = {
     # Padding at the end of a message is defined but not written.
     "vehicle_local_position": (

@@ -98,9 +98,6 @@ def box(changed: float = 0.971) -> Occupancy:
     return Occupancy(grid, np.array([-1.0, 0.4, 0.2]), 0.2)
 
 
-# --- OctoMaps ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_octomap_is_that_of_its_file(tmp_path: Path, container: Container) -> None:
     file = as_bt(box(), tmp_path / "site")
@@ -137,9 +134,6 @@ def test_damaged_and_empty_maps_are_counted(tmp_path: Path) -> None:
     assert any(re.search(r"tree.*\(2 ", note) for note in found.notes)
 
 
-# --- the log's world -----------------------------------------------------------------------------------
-
-
 def voxels_of(points: NDArray[np.float64]) -> Occupancy:
     voxels = VoxelSet("cloud", None)
     voxels.add(points)
@@ -173,9 +167,6 @@ def test_transforms_of_the_log_place_a_map(tmp_path: Path) -> None:
     assert any(re.search("'site'.*'map'", note) for note in found.notes)
 
 
-# --- floor plans ---------------------------------------------------------------------------------------
-
-
 def plan() -> Cells:
     cells = np.zeros((4, 3), np.int8)
     cells[1, 2], cells[3, 0], cells[0, 0] = 100, 60, -1
@@ -194,8 +185,6 @@ def test_plan_is_raised_from_its_origin(tmp_path: Path, container: Container) ->
     )
     assert (one.origin.tolist(), one.resolution_m) == ([-3.0, 7.0, 1.25], 0.5)
 
-
-# --- clouds --------------------------------------------------------------------------------------------
 
 POINTS = np.array(
     [[0.1, 0.1, 0.1], [0.15, 0.1, 0.1], [-3.7, 2.2, 5.01], [1.0, np.nan, 2.0], [4.3, -2.1, 0.3], [9, 9, 9]]

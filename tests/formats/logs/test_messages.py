@@ -49,9 +49,6 @@ def is_the_pose(sample: PoseSample, target: str, source: str) -> bool:
     ) and (sample.target, sample.source) == (target, source)
 
 
-# --- poses and transforms ------------------------------------------------------------------------------
-
-
 @both_ros
 def test_odometry_keeps_its_covariance_and_both_frames(version: str) -> None:
     sample = only(odometry(version, STAMP, POSITION, QUATERNION, COVARIANCE), "nav_msgs/msg/Odometry")
@@ -133,9 +130,6 @@ def test_foxglove_transforms(encoding: str) -> None:
     assert all(isinstance(s, PoseSample) and is_the_pose(s, "map", "base") for s in found)
 
 
-# --- gimbals -------------------------------------------------------------------------------------------
-
-
 @both_ros
 def test_gimbal_angles(version: str) -> None:
     name = "geometry_msgs/msg/Vector3Stamped"
@@ -146,9 +140,6 @@ def test_gimbal_angles(version: str) -> None:
         version, name, header=header(version, STAMP), quaternion=part(version, "Quaternion", *QUATERNION)
     )
     assert only(value, name) == AngleSample(STAMP, RECEIVED, None, QUATERNION)
-
-
-# --- intrinsics ----------------------------------------------------------------------------------------
 
 
 def lens(value: Any, type_name: str = "sensor_msgs/msg/CameraInfo") -> Intrinsics:

@@ -89,9 +89,6 @@ def test_covariances_turn_with_the_body() -> None:
     assert gathered_from(unknown, "d1", stamps="header").trajectory.covariance is None
 
 
-# --- gimbals -------------------------------------------------------------------------------------------
-
-
 def test_gimbal_angles_and_quaternions_say_the_same() -> None:
     angles = np.random.default_rng(5).uniform(-80, 80, size=(20, 3))
     turned = Rotation.from_euler("ZYX", angles, degrees=True)
@@ -110,9 +107,6 @@ def test_gimbal_angles_and_quaternions_say_the_same() -> None:
             matrix_from_quaternion(found.quaternion_xyzw), turned.as_matrix(), rtol=0, atol=1e-12
         )
         assert not found.position.any()
-
-
-# --- transforms ----------------------------------------------------------------------------------------
 
 
 def static(frames: tuple[str, str], position: tuple[float, float, float]) -> PoseSample:
@@ -172,9 +166,6 @@ def test_frames_that_cannot_be_chained_are_refused() -> None:
         chained(transforms, "d1.mcap", parent="odom", child="camera", stamps="header", max_gap_ns=S)
     with refused("data", "d1.mcap", "topic", "transforms"):
         transforms_of([AngleSample(1, 1, (0, 0, 0), None)], "d1.mcap")
-
-
-# --- real logs -----------------------------------------------------------------------------------------
 
 
 def real_messages(path: Path, topics: Sequence[str]) -> Iterator[Message]:

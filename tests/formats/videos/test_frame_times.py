@@ -32,9 +32,6 @@ def subtitles(clocks: list[str], step_ms: int = 40) -> str:
     return "\n".join(blocks)
 
 
-# --- CSV ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -60,9 +57,6 @@ def test_rows_that_cannot_be_used_are_counted_by_cause(tmp_path: Path) -> None:
     assert stamps.frame.tolist() == [0, 2, 5]
     assert stamps.t_ns.tolist() == [1_000_000_000, 3_000_000_000, 4_000_000_000]
     assert sorted(stamps.dropped.values()) == [1, 1, 1, 2, 3]  # cut line, time, twice; late; number
-
-
-# --- subtitles ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -105,9 +99,6 @@ def test_clocks_of_every_spelling(tmp_path: Path) -> None:
     ]
     assert stamps.media_ns is not None
     assert stamps.media_ns.tolist() == [0, 40_000_000, 80_000_000]
-
-
-# --- to a video's frames --------------------------------------------------------------------------------
 
 
 def test_times_by_frame_number() -> None:

@@ -42,9 +42,6 @@ def decoded_by_opencv(path: Path) -> tuple[list[Picture], list[float]]:
     return pictures, milliseconds
 
 
-# --- stamps --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("b_frames", [0, 2])
 @pytest.mark.parametrize("ticks", [even_ticks(40), uneven_ticks(40)], ids=["constant", "variable"])
 def test_stamps_are_those_written(tmp_path: Path, ticks: list[int], b_frames: int) -> None:
@@ -102,9 +99,6 @@ def test_frames_that_vp8_never_shows_are_none(tmp_path: Path) -> None:
         assert [round(t / 1e9 * 30) for t in reader.index.pts_ns.tolist()] == shown
 
 
-# --- pictures ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "codec"),
     [
@@ -144,9 +138,6 @@ def test_pictures_are_opencvs(tmp_path: Path, turned_deg: int) -> None:
     assert mine[0].flags.c_contiguous
     # The same libraries; their two conversions to BGR may round differently by a level or two.
     assert max(np.abs(a.astype(int) - b).max() for a, b in zip(mine, pictures, strict=True)) <= 2
-
-
-# --- damage --------------------------------------------------------------------------------------------
 
 
 def test_a_damaged_frame_is_missing_and_the_others_keep_their_numbers(
@@ -335,9 +326,6 @@ def test_a_display_matrix_that_mirrors_is_refused(tmp_path: Path) -> None:
         READER.index(path)
 
 
-# --- registry and real recordings -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["cam01", "cam02"])
 def test_real_recordings_decode_as_ffmpeg_does(name: str) -> None:
     path = real_data(f"pose2sim_single/videos/{name}.mp4")
@@ -373,9 +361,6 @@ def test_the_stated_time_of_creation_is_read(tmp_path: Path, stated: str | None,
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
     assert created_ns(path) == made_ns
-
-
-# --- black bars ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bars", [(0, 0, 0, 0), (0, 7, 0, 8), (33, 0, 21, 0)])
