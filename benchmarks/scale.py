@@ -1,6 +1,6 @@
 """Long flights: errors, memory and time of the commands.
 
-    python -m benchmarks.scale [--minutes 2 10]        # memory and processor time of each command
+    python -m benchmarks.scale [--minutes 2 10]        # memory, time and page of each command
     python -m benchmarks.scale --accuracy [--count 8]  # `auto` beside `robust` on flights of 90 s
 
 Everything is simulated, with modelled keypoints and no film. Each command of --minutes has a process of its
@@ -65,16 +65,18 @@ def flown(seed: int, seconds: float, place: Path) -> Path:
 
 
 def commands(minutes: float) -> Iterator[list[str]]:
-    """Run the commands of a session of so many minutes; yield command, peak MB and processor seconds."""
+    """Run the commands of a session of so many minutes; yield command, peak MB, processor s, page MB."""
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
         session = ingest(flown(300, 60 * minutes, Path(folder)), Path(folder) / "long.session").folder
         for command, *options in COMMANDS:
             peak_mb, took_s = cost_of(command, str(session), *options)
-            yield [f"{minutes:g}", command, fixed(peak_mb), fixed(took_s)]
+            row = [f"{minutes:g}", command, fixed(peak_mb), fixed(took_s), ""]
             if command == "report":
                 page_mb = (session / "report" / "index.html").stat().st_size / 1e6
+                row[-1] = fixed(page_mb, 1)
                 if peak_mb > MAX_REPORT_MB or page_mb > MAX_PAGE_MB:
                     raise SystemExit(f"a page of {page_mb:.1f} MB took {peak_mb:.0f} MB of memory")
+            yield row
 
 
 def cost_of(command: str, *options: str) -> tuple[float, float]:
@@ -124,7 +126,7 @@ def main() -> None:
         seeds = range(options.first, options.first + options.count)
         rows = [row for seed in seeds for row in accuracy(seed)]
     else:
-        key, header = "scale", ["minutes", "command", "peak MB", "CPU s"]
+        key, header = "scale", ["minutes", "command", "peak MB", "CPU s", "page MB"]
         rows = [row for minutes in options.minutes for row in commands(minutes)]
     show(key, markdown_table(header, rows), write=options.write)
 
