@@ -264,6 +264,11 @@ class _ManifestWriter:
                 free = "neither names nor times nor the motion in its pictures tell which of the poses below"
             remark = self.miss(camera, "pose", free)
             others = self.others("pose", self.draft.free_poses)
+            films = [each for each in self.draft.cameras if each.film and "pose" not in each.choices]
+            if 1 < len(films) == len(self.draft.cameras):
+                others.append(
+                    f"# or pose: {PICTURES}  # drones that fly about; say stature_m, frame_times.start"
+                )
             return DraftedKey(None, [remark], others, example={"file": f"{camera.name}.tum"})
         taken, remarks = choice.taken, []
         if not choice.named:

@@ -259,6 +259,9 @@ def test_subtitles_and_a_film_are_a_whole_flight(tmp_path: Path) -> None:
         assert not {"gimbal", "mount"} & camera.keys()
         assert camera["intrinsics"]["fx"] == pytest.approx(24 / 36 * SIZE[0], abs=0.1)
         assert camera["intrinsics"]["assumed"] is True
+        (tmp_path / f"DJI_{k}.SRT").unlink()
+    result.path.unlink()
+    assert drafted(tmp_path)[0].text.count("# or pose: pictures ") == 2
 
 
 def test_a_film_turns_the_camera_of_a_log_with_fixes_alone(tmp_path: Path) -> None:
