@@ -43,7 +43,6 @@ from pipelines.reconstruction.bodies import (
     body_figures,
     body_parts,
     fit_bodies,
-    load_true_bodies,
     shape_rows,
 )
 from pipelines.reconstruction.body_fit import BodyFit
@@ -262,9 +261,7 @@ def reconstruct(
             bodies = fit_bodies(stored.observations, stored.views, stored.result)
         metrics = stored.metrics | {
             "gait": walks,
-            "body": body_figures(
-                stored.observations.t_ns, stored.metrics["people"]["names"], bodies, load_true_bodies(folder)
-            ),
+            "body": body_figures(stored.observations.t_ns, stored.metrics["people"]["names"], bodies, folder),
             "doubts": [doubt.as_json() for doubt in doubts],
         }
         warnings = [

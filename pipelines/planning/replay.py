@@ -349,6 +349,8 @@ BACKGROUND_SIGMA = (1e-3, 1e-4)
 KNOT_S, MOST_KNOTS = 2.0, 40
 # One random stream for each: poses err alike in every measurement, however many numbers a detector draws.
 POSES, KEYPOINTS = range(2)
+# Trials are measured together until they have so many errors of joints: some 150 MB with what they need.
+ERRORS_TOGETHER = 4_000_000
 # Keypoints below this confidence are left out, as in `mocap reconstruct`.
 MIN_CONFIDENCE = 0.3
 
@@ -577,39 +579,45 @@ def measure(
     if paths.others is not None and len(paths.others):
         eyes, others = paths.position[:, :, None], paths.others[:, None, :, None]
         free &= ~hidden_by_people(eyes, standing_in, others)
-    own = np.full((trials, times, count, 3), np.nan, dtype=np.float32)
-    logged, passed = np.empty((trials, times, cameras, 6)), np.empty((trials, times, cameras, 3))
+    error = np.empty((trials, times, count), dtype=np.float32)
     smoother = _Smoother(paths, standing_in)
     true_rotation = matrix_from_quaternion(paths.quaternion_xyzw)
-    for trial in range(trials):
-        rays = np.empty((times, count, cameras, 2))
-        weight = np.empty((times, count, cameras))
-        for i, lens in enumerate(paths.intrinsics):
-            path, attitude = paths.position[i], paths.quaternion_xyzw[i]
-            rng = np.random.default_rng([seed, POSES, trial, i])
-            shifted, turned = disturb(paths.noise[i], paths.t_ns, path, attitude, rng)
-            logged[trial, :, i, :3] = shifted - path
-            logged[trial, :, i, 3:] = rotation_vector_from_quaternion(multiply(conjugate(attitude), turned))
-            rng = np.random.default_rng([seed, KEYPOINTS, trial, i, paths.person])
-            xy, confidence = detect(pixels[i], free[i], path, paths.middle, joints, _focal(lens), rng)
-            rays[:, :, i] = undistort(xy, lens)
-            weight[:, :, i] = np.where(confidence >= MIN_CONFIDENCE, confidence, 0.0)
-        views = Views(
-            rays=rays.reshape(-1, cameras, 2),
-            weight=weight.reshape(-1, cameras),
-            pose_index=np.repeat(np.arange(times), count),
-            position=paths.position.swapaxes(0, 1),
-            rotation=true_rotation.swapaxes(0, 1),
-            focal=np.array([_focal(lens) for lens in paths.intrinsics]),
-            pixel_sigma=np.full(cameras, PIXEL_SIGMA_PX),
-            pose_sigma=np.zeros((times, cameras, 2)),
-        )
-        found = triangulate(views, method="robust", with_covariance=False)
-        off = found.points.reshape(joints.shape) - joints
-        seen = found.inlier.reshape(times, count, cameras) & np.isfinite(off[..., :1])
-        passed[trial] = smoother.passed(rays, seen)
-        own[trial] = smoother.own(off, seen)
-    error = np.linalg.norm(own + smoother.shared(passed, logged)[:, :, None], axis=-1).astype(np.float32)
+    for together in np.array_split(
+        np.arange(trials), min(trials, 1 + trials * known.size // ERRORS_TOGETHER)
+    ):
+        own = np.full((len(together), times, count, 3), np.nan, dtype=np.float32)
+        logged = np.empty((len(together), times, cameras, 6))
+        passed = np.empty((len(together), times, cameras, 3))
+        for row, trial in enumerate(together.tolist()):
+            rays = np.empty((times, count, cameras, 2))
+            weight = np.empty((times, count, cameras))
+            for i, lens in enumerate(paths.intrinsics):
+                path, attitude = paths.position[i], paths.quaternion_xyzw[i]
+                rng = np.random.default_rng([seed, POSES, trial, i])
+                shifted, turned = disturb(paths.noise[i], paths.t_ns, path, attitude, rng)
+                logged[row, :, i, :3] = shifted - path
+                logged[row, :, i, 3:] = rotation_vector_from_quaternion(multiply(conjugate(attitude), turned))
+                rng = np.random.default_rng([seed, KEYPOINTS, trial, i, paths.person])
+                xy, confidence = detect(pixels[i], free[i], path, paths.middle, joints, _focal(lens), rng)
+                rays[:, :, i] = undistort(xy, lens)
+                weight[:, :, i] = np.where(confidence >= MIN_CONFIDENCE, confidence, 0.0)
+            views = Views(
+                rays=rays.reshape(-1, cameras, 2),
+                weight=weight.reshape(-1, cameras),
+                pose_index=np.repeat(np.arange(times), count),
+                position=paths.position.swapaxes(0, 1),
+                rotation=true_rotation.swapaxes(0, 1),
+                focal=np.array([_focal(lens) for lens in paths.intrinsics]),
+                pixel_sigma=np.full(cameras, PIXEL_SIGMA_PX),
+                pose_sigma=np.zeros((times, cameras, 2)),
+            )
+            found = triangulate(views, method="robust", with_covariance=False)
+            off = found.points.reshape(joints.shape) - joints
+            seen = found.inlier.reshape(times, count, cameras) & np.isfinite(off[..., :1])
+            passed[row] = smoother.passed(rays, seen)
+            own[row] = smoother.own(off, seen)
+        for row, shared in enumerate(smoother.shared(passed, logged)):
+            error[together[row]] = np.linalg.norm(own[row] + shared[:, None], axis=-1)
     return MeasuredJoints(error, int(known.sum()))
 
 

@@ -261,22 +261,19 @@ def shape_rows(bodies: Sequence[BodyFit | None]) -> pd.DataFrame:
 # --- figures -------------------------------------------------------------------------------------------
 
 
-def load_true_bodies(folder: Path) -> list[MovingBody]:
-    """Load the true bodies of a simulated flight; an empty list if the session has none."""
-    if not (folder / "truth_body.parquet").is_file():
-        return []
-    return load_bodies(folder / "truth_body.parquet", folder / "truth_body_shape.parquet")
-
-
 def body_figures(
-    t_ns: Int64, names: Sequence[str], bodies: Sequence[BodyFit | None], truth: Sequence[MovingBody]
+    t_ns: Int64, names: Sequence[str], bodies: Sequence[BodyFit | None], folder: Path
 ) -> dict[str, Any]:
-    """Compute the stature of each person, and with true surfaces the errors of vertices and joint centres.
+    """Compute each person's stature, and with a session's true surfaces errors of vertices and joint centres.
 
     MPVPE is the mean distance of vertices, in mm; root-relative after the pelvis's joints were subtracted. So
     are the centres of shoulders, elbows, hips, knees and ankles; no landmark takes part in them.
     """
     figures: dict[str, Any] = {}
+    truth: list[MovingBody] = []
+    rows = [body.row[_compared(body)] for body in bodies if body is not None]
+    if rows and (path := folder / "truth_body.parquet").is_file():
+        truth = load_bodies(path, folder / "truth_body_shape.parquet", t_ns[np.concatenate(rows)])
     for name, body in zip(names, bodies, strict=False):
         if body is None:
             figures[name] = None
@@ -291,9 +288,13 @@ def body_figures(
     return figures
 
 
+def _compared(body: BodyFit) -> Int64:
+    """Choose the poses of a body that are compared with the truth."""
+    return np.unique(np.linspace(0, len(body.row) - 1, _COMPARED_TIMES).astype(np.int64))
+
+
 def _surface_errors(t_ns: Int64, body: BodyFit, truth: MovingBody) -> dict[str, float | None]:
-    model = body_model()
-    chosen = np.unique(np.linspace(0, len(body.row) - 1, _COMPARED_TIMES).astype(np.int64))
+    model, chosen = body_model(), _compared(body)
     true = [
         interpolate_poses(
             truth.t_ns,

@@ -422,9 +422,15 @@ def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = 
     return motion
 
 
-def load_bodies(bodies_path: Path, shapes_path: Path) -> list[MovingBody]:
-    """Load the bodies of two files, see `moving_bodies`."""
-    return moving_bodies(read_table(bodies_path, BODY), read_table(shapes_path, BODY_SHAPE))
+def load_bodies(bodies_path: Path, shapes_path: Path, around_ns: Int64 | None = None) -> list[MovingBody]:
+    """Load the bodies of two files, see `moving_bodies`; only with their times next to some, if stated."""
+    shapes = read_table(shapes_path, BODY_SHAPE)
+    if around_ns is None:
+        return moving_bodies(read_table(bodies_path, BODY), shapes)
+    times = distinct(bodies_path, "t_ns")
+    after = np.searchsorted(times, around_ns)
+    near = np.intersect1d(np.concatenate([after - 1, after]), np.arange(len(times)))
+    return moving_bodies(read_rows(bodies_path, BODY, "t_ns", times[near]), shapes)
 
 
 def moving_bodies(table: pd.DataFrame, shapes: pd.DataFrame) -> list[MovingBody]:
