@@ -54,8 +54,10 @@ from pipelines.session.tables import (
     POSES,
     TRUTH,
     actor_table,
+    join_tables,
     motion_table,
     pose_table,
+    read_parts,
     read_table,
     trajectory_from,
     write_table,
@@ -96,7 +98,7 @@ from pipelines.sources.pictures import open_files
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=18)
+INGEST = Stage("ingest", revision=19)
 
 OF_ONE_CAMERA = (
     "one camera gives a rough estimate: how far away people are is told by their stature alone; a second"
@@ -486,10 +488,14 @@ class _FlightReader:
 
     def _store_true_bodies(self, folder: Path, stated: str) -> None:
         place = located(self._flight_path.parent, stated)
-        bodies = read_table(place, BODY)
-        centre = bodies[["x", "y", "z"]].to_numpy(np.float64)
-        bodies[["x", "y", "z"]] = self.poses.joints(place, centre, own_axes=False)
-        write_table(folder / "truth_body.parquet", bodies, BODY)
+
+        def moved(part: pd.DataFrame) -> pd.DataFrame:
+            centre = part[["x", "y", "z"]].to_numpy(np.float64)
+            part[["x", "y", "z"]] = self.poses.joints(place, centre, own_axes=False)
+            return part
+
+        parts = (moved(part) for part in read_parts(place, BODY) if len(part))
+        join_tables(folder / "truth_body.parquet", parts, BODY)
         shape = located(self._flight_path.parent, shape_file(stated))
         write_table(folder / "truth_body_shape.parquet", read_table(shape, BODY_SHAPE), BODY_SHAPE)
 

@@ -235,7 +235,7 @@ def _batches(opened: Any, columns: Sequence[str] | None = None) -> Iterator[Any]
         yield from opened.iter_batches(ROWS_PER_BATCH, row_groups=[group], columns=columns)
 
 
-def _parts(path: Path, schema: pa.Schema) -> Iterator[pd.DataFrame]:
+def read_parts(path: Path, schema: pa.Schema) -> Iterator[pd.DataFrame]:
     """Yield what `read_table` returns in parts; the first has the columns and no rows."""
     with _opened(path) as opened:
         yield _frame_of(path, opened.schema_arrow.empty_table(), schema)
@@ -412,12 +412,12 @@ def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
 def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = None) -> JointMotion:
     """Read the motion of these joints (None: of all) as `motion_from` does, with parts of the table."""
     times, people, names = [np.empty(0, np.int64)], 1, dict[str, None]()
-    for part in _parts(path, schema):
+    for part in read_parts(path, schema):
         times.append(np.unique(part["t_ns"].to_numpy(np.int64)))
         people = max(people, _people_of(part))
         names |= dict.fromkeys(part["joint"].unique())
     motion = _unknown_motion(np.unique(np.concatenate(times)), joints or tuple(names), people, part)
-    for part in _parts(path, schema):
+    for part in read_parts(path, schema):
         _fill_motion(motion, part)
     return motion
 
