@@ -98,7 +98,7 @@ def batch_command(
     if workers is not None and scheduler is not None:
         raise click.UsageError("--workers are those of this machine: leave them out with --scheduler.")
     from pipelines.batch import batch
-    from pipelines.session.urls import url_of
+    from pipelines.session.storage import url_of
 
     with watching(shown.level) as progress:
         result = batch(

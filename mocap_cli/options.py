@@ -58,7 +58,7 @@ def is_url(place: Path | str) -> bool:
     """Return True for a place in an object store."""
     if ":/" not in str(place):
         return False
-    from pipelines.session.urls import url_of
+    from pipelines.session.storage import url_of
 
     return url_of(place) is not None
 

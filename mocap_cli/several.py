@@ -27,7 +27,8 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
             found[Path(text)] = None
             continue
         if is_url(text):
-            from pipelines.session.urls import matching, url_of
+            from pipelines.session.storage import url_of
+            from pipelines.session.urls import matching
 
             matches = matching(url_of(text) or text)
         else:
@@ -43,7 +44,8 @@ def _here(stack: ExitStack, argument: str, suffix: str, options: dict[str, Any])
     place, output = options[argument], options.get("output")
     own: dict[str, Any] = {}
     if is_url(place):
-        from pipelines.session.urls import fetched, holds_session, session_here, url_of
+        from pipelines.session.storage import url_of
+        from pipelines.session.urls import fetched, holds_session, session_here
 
         url = url_of(place) or ""
         if options.get("scheduler"):

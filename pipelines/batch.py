@@ -28,8 +28,8 @@ from pipelines.session.parallel import connected, local_cluster, result_of
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.registries import need
 from pipelines.session.stages import names_of
-from pipelines.session.storage import as_data_error, make_folder, read_json, write_whole
-from pipelines.session.urls import as_urls, fetched, get, put, session_here, url_of
+from pipelines.session.storage import as_data_error, make_folder, read_json, url_of, write_whole
+from pipelines.session.urls import as_urls, fetched, get, put, session_here
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 

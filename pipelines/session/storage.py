@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import unquote
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -73,6 +74,33 @@ MAX_JSON_BYTES = 1 << 26
 
 # Files of the kernel look like files of a size that they do not have, and reading some never ends.
 _OF_THE_KERNEL = ("/proc/", "/sys/")
+
+
+# fsspec has many more, some of which open files of this machine, archives, or other URLs.
+SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "http", "https", "file")
+
+_URL = re.compile(r"(?is)(?P<scheme>[a-z][a-z0-9+.-]+):(?P<chained>:.*:)?/+(?P<rest>[^/].*)")
+_IPV6 = re.compile(r"(?i)^\[[0-9a-f:.]+\]")
+_SECRET = re.compile(
+    r"(?i)[?&#;][^=&/]*(sig|token|key|secret|credential|pass|pw|auth|jwt|code|\bsas\b)[^=&/]*(=|&|$)"
+)
+
+
+def url_of(place: Path | str) -> str | None:
+    """Return the URL that a place is; None for a path. DataError: it holds a secret or is not fetched."""
+    text = str(place)
+    found = _URL.fullmatch(text)
+    if found is None or os.path.lexists(text):
+        return None
+    scheme, rest = found["scheme"].lower(), found["rest"].rstrip("/")
+    if found["chained"] or "::" in _IPV6.sub("", rest) or scheme not in SCHEMES:
+        problem = f"is a kind of URL that mocap does not open (it opens {', '.join(SCHEMES)})"
+        remedy = "copy the file to this machine, and give its path"
+        raise DataError(f"{scheme}://...", problem, remedy, code="url-refused")
+    if "@" in unquote(rest.partition("/")[0]) or _SECRET.search(unquote(rest)):
+        remedy = "leave them out of it, and set them where the store's own tools look for them"
+        raise DataError(f"{scheme}://...", "is a URL with credentials in it", remedy, code="url-with-secret")
+    return f"{scheme}:///{rest}" if scheme == "file" else f"{scheme}://{rest}"
 
 
 # A file of holes takes no place on a disk, and seconds for each gigabyte to read; less is soon read.

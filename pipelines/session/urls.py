@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
-from urllib.parse import unquote
 
 from filelock import FileLock
 
@@ -31,41 +30,17 @@ from pipelines.session.storage import (
     remove_tree,
     sha256_of,
     sync_tree,
+    url_of,
     write_json,
 )
-
-# fsspec has many more, some of which open files of this machine, archives, or other URLs.
-SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "http", "https", "file")
 
 # A disk that is filled to the last byte stops every other program of the user.
 MIN_FREE_BYTES_BESIDE_SOURCES = 1 << 30
 
-_URL = re.compile(r"(?is)(?P<scheme>[a-z][a-z0-9+.-]+):(?P<chained>:.*:)?/+(?P<rest>[^/].*)")
-_IPV6 = re.compile(r"(?i)^\[[0-9a-f:.]+\]")
-_SECRET = re.compile(
-    r"(?i)[?&#;][^=&/]*(sig|token|key|secret|credential|pass|pw|auth|jwt|code|\bsas\b)[^=&/]*(=|&|$)"
-)
 _REFUSED = {"PermissionError", "NoCredentialsError", "PartialCredentialsError", "TokenRetrievalError"}
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 
 T = TypeVar("T")
-
-
-def url_of(place: Path | str) -> str | None:
-    """Return the URL that a place is; None for a path. DataError: it holds a secret or is not fetched."""
-    text = str(place)
-    found = _URL.fullmatch(text)
-    if found is None or os.path.lexists(text):
-        return None
-    scheme, rest = found["scheme"].lower(), found["rest"].rstrip("/")
-    if found["chained"] or "::" in _IPV6.sub("", rest) or scheme not in SCHEMES:
-        problem = f"is a kind of URL that mocap does not open (it opens {', '.join(SCHEMES)})"
-        remedy = "copy the file to this machine, and give its path"
-        raise DataError(f"{scheme}://...", problem, remedy, code="url-refused")
-    if "@" in unquote(rest.partition("/")[0]) or _SECRET.search(unquote(rest)):
-        remedy = "leave them out of it, and set them where the store's own tools look for them"
-        raise DataError(f"{scheme}://...", "is a URL with credentials in it", remedy, code="url-with-secret")
-    return f"{scheme}:///{rest}" if scheme == "file" else f"{scheme}://{rest}"
 
 
 def located(base: Path, stated: str | Path) -> Path:

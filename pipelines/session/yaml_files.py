@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from pipelines.session.errors import DataError
-from pipelines.session.storage import read_text
-from pipelines.session.urls import url_of
+from pipelines.session.storage import read_text, url_of
 from pipelines.session.yaml_models import YamlModel, describe_problem
 
 # A real file has a few thousand bytes, and a parser of YAML needs seconds for a million.

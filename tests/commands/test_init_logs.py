@@ -247,8 +247,7 @@ def test_subtitles_and_a_film_are_a_whole_flight(tmp_path: Path) -> None:
     flight = write_flight(tmp_path / "x", cameras=2, seconds=1.0, clean=True)
     for k in range(2):
         path = write_srt(tmp_path / f"DJI_{k}.SRT", drone_of(flight, k), gimbal=False)
-        text = path.read_text(encoding="utf-8").replace("[iso", f"[focal_len : {240 if k else 24.0}] [iso")
-        path.write_text(text, encoding="utf-8")
+        path.write_text(path.read_text().replace("[iso", f"[focal_len : {240 if k else 24.0}] [iso"))
         write_video(tmp_path / f"DJI_{k}.mp4", even_ticks(15, step=6000))
     shutil.rmtree(tmp_path / "x")
     result, stated = drafted(tmp_path)
@@ -286,8 +285,7 @@ def test_two_drones_of_dji_get_their_own_flight_records(tmp_path: Path) -> None:
     for k, record in enumerate(("late", "early")):
         truth = drone_of(flight, k)
         path = write_srt(tmp_path / f"DJI_{k}.SRT", truth)
-        text = re.sub(r"\[gb_yaw[^]]*\]", "", path.read_text(encoding="utf-8"))
-        path.write_text(text, encoding="utf-8")
+        path.write_text(re.sub(r"\[gb_yaw[^]]*\]", "", path.read_text()))
         write_record(tmp_path / f"{record}.csv", truth)
         write_video(tmp_path / f"DJI_{k}.mp4", even_ticks(15, step=6000))
     shutil.rmtree(tmp_path / "x")

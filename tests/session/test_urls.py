@@ -6,7 +6,8 @@ import pytest
 
 from pipelines.session import urls
 from pipelines.session.errors import BusyError
-from pipelines.session.urls import fetched, located, matching, put, session_here, source_url, url_of
+from pipelines.session.storage import url_of
+from pipelines.session.urls import fetched, located, matching, put, session_here, source_url
 from tests.commands.runner import content, mocap, refused, succeeds
 from tests.fuzz.foreign import FIRST_LINE, PUBLIC, SECRET, Server, served
 from tests.raising import refused as refusing
