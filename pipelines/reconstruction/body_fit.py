@@ -55,6 +55,9 @@ _CAUCHY = 3.0
 _BOUND_RAD = np.radians(5.0)
 # A range is taken as two standard deviations to both sides of the usual posture.
 _USUAL_SHARE = 0.5
+# Who crouches or lies is far from usual in many joints: a joint beyond so many standard deviations has less
+# than half of its weight.
+_USUAL_CAUCHY = 2.0
 # A relaxed arm bends its elbow by so much, degrees.
 _USUAL_ELBOW_DEG = -20.0
 # No landmark is surer than this, whatever a covariance says.
@@ -342,6 +345,10 @@ class Points:
         cost = _CAUCHY**2 * np.log1p(square / _CAUCHY**2).sum(axis=1)
         return arms, root, white * bounded, cost, slope.reshape(count, 3 * many, -1)
 
+    def costs(self, poses: Poses, seen: Places | Rays, shared: Shared) -> Float:
+        """Compute the cost [N] of each moment's landmarks."""
+        return self._whitened(poses, seen, shared)[3]
+
     def normal(self, poses: Poses, seen: Places | Rays, shared: Shared, *, whole: bool) -> Normal:
         """Build the normal equations; those of shared unknowns only if `whole`."""
         stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
@@ -474,9 +481,11 @@ def _add_ranges(turn: Float, pose: Float, right: Float) -> Float:
         quaternion_from_matrix(np.swapaxes(frame, -1, -2) @ turn[:, bones])
     )
     beyond = np.where(vector < low, vector - low, np.where(vector > high, vector - high, 0.0))
-    weight, steep = usual.sigma**-2, np.where(beyond == 0.0, 0.0, _BOUND_RAD**-2)
+    steep = np.where(beyond == 0.0, 0.0, _BOUND_RAD**-2)
     away = vector - usual.usual
-    cost = np.sum(weight * away**2 + steep * beyond**2, axis=(1, 2))
+    square = np.sum((away / usual.sigma) ** 2, axis=-1, keepdims=True) / _USUAL_CAUCHY**2
+    weight = usual.sigma**-2 / (1 + square)
+    cost = _USUAL_CAUCHY**2 * np.log1p(square).sum(axis=(1, 2)) + np.sum(steep * beyond**2, axis=(1, 2))
 
     slope = _inverse_left_jacobian(vector) @ np.swapaxes(frame, -1, -2)
     weighted = np.swapaxes(slope, -1, -2) * (weight + steep)[..., None, :]

@@ -5,8 +5,8 @@ centimetres, it stands on the ground, its joints have ranges, and it moves smoot
 `body_fit`, with the directions of landmarks in the place of their positions, and with four more terms:
 
 - the pelvis is upright to some 20 degrees, bounded (Cauchy);
-- the lowest point of soles, knees and fingertips is on the ground, and no other is below it. How much
-  higher the ground is than thought, in the frame of the camera's log, is an unknown that all moments share;
+- the lowest point of soles, knees, fingertips, head and trunk is on the ground, and no other is below it.
+  How much higher the ground is than thought, in the camera's frame, is an unknown that all moments share;
 - accelerations of the root and angular accelerations of the bones are normal, bounded (Cauchy);
 - the prior of the stature is narrow.
 
@@ -92,6 +92,10 @@ _BONE_RADPS2 = {
 # Limbs that could as well point the other way err more than derivatives say. With it the NEES of joints is 3
 # on the tuning flights.
 _WIDENED = 1.3
+# Mean cost of a landmark where the detector errs as usual, on the tuning flights: 0.06 to 0.12.
+_USUAL_MISFIT = 0.12
+# A detector fails for about as long: covariances grow with the mean misfit of so many moments.
+_ALIKE_MOMENTS = 5
 # Limbs that bend towards the camera unseen make a person look nearer: on the tuning flights distances err by
 # this share beside what the fit says.
 _DISTANCE_SHARE = 0.02
@@ -192,10 +196,25 @@ def _fit_windows(
         own = _poses_of(fit.poses, inner), fit.shared, fit.covariance[inner], fit.answer[inner]
         turning, *joints = points.spread_of_joints(*own, fit.shared_covariance)
         places = points.spread(*own, fit.shared_covariance)
-        widened = (_WIDENED * each for each in (turning, joints[1], places[1]))
+        wider = _WIDENED * _misfit(points, _of(rays, part), fit)[inner, None, None, None]
+        widened = (wider * each for each in (turning, joints[1], places[1]))
         parts.append((own[0].turn, own[0].root, *widened))
     turn, root, *covariances = (np.concatenate(part) for part in zip(*parts, strict=True))
     return _at_every_time(points, t_ns, row, Poses(root, turn), fit, covariances)
+
+
+def _misfit(points: StandingPoints, rays: Rays, fit: _Fit) -> Float:
+    """Return the factor [N] of variances, 1 or more: misfits of landmarks relative to usual ones.
+
+    A detector that sees people upside down or lying errs by more than the table of landmarks says. Misfits
+    show it: this is the a posteriori variance factor of adjustments, of moments near each other.
+    """
+    cost = points.costs(fit.poses, rays, fit.shared) / rays.direction.any(axis=-1).sum(axis=1)
+    near, half = np.cumsum(np.concatenate([[0.0], cost])), _ALIKE_MOMENTS // 2
+    first = np.maximum(np.arange(len(cost)) - half, 0)
+    last = np.minimum(np.arange(len(cost)) + half + 1, len(cost))
+    mean = (near[last] - near[first]) / (last - first)
+    return np.asarray(np.maximum(mean / _USUAL_MISFIT, 1.0))
 
 
 def _at_every_time(
@@ -251,13 +270,13 @@ def _poses_of(poses: Poses, part: Index | slice | Bool) -> Poses:
 
 @cache
 def _contacts() -> tuple[Index, Float]:
-    """Return bones [10] and offsets [10, 3] of heels, balls, toes' tips, knees and fingertips."""
+    """Return bones [34] and offsets [34, 3] of soles, knees, fingertips, and the outermost of the trunk."""
     model = body_model()
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1))
     surface = model.surface(np.array([1.0, *np.zeros(11)]), np.zeros(3), upright)
     centres = model.centres
     bones, offsets = [], []
-    for side in SIDES:
+    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
         for part, ends in (("foot", (np.min, np.max)), ("toes", (np.max,))):
             bone = BONE[f"{side}_{part}"]
             own = surface[model.weights.argmax(axis=1) == bone]
@@ -266,11 +285,13 @@ def _contacts() -> tuple[Index, Float]:
                 bones.append(bone)
                 point = np.array([end(lowest[:, 0]), lowest[:, 1].mean(), own[:, 2].min()])
                 offsets.append(point - centres[bone])
-        for part in ("shank", "hand"):
-            bone = BONE[f"{side}_{part}"]
-            own = surface[model.weights.argmax(axis=1) == bone] - centres[bone]
-            bones.append(bone)
-            offsets.append(own[(own[:, 0] if part == "shank" else np.linalg.norm(own, axis=1)).argmax()])
+        for part in ("shank", "hand", "head", "chest", "pelvis"):
+            bone = BONE[part if part in BONE else f"{side}_{part}"]
+            own = surface[(model.weights.argmax(axis=1) == bone) & (sign * surface[:, 1] > 0)] - centres[bone]
+            x, y, z = own.T
+            keys = {"shank": [x], "hand": [np.linalg.norm(own, axis=1)]}.get(part, [x, -x, sign * y, z])
+            bones += [bone] * len(keys)
+            offsets += [own[key.argmax()] for key in keys]
     return np.array(bones), np.array(offsets)
 
 
@@ -280,7 +301,7 @@ class StandingPoints(Points):
     def __init__(self, landmarks: Landmarks, ground: GroundHeight, stature_m: tuple[float, float]) -> None:
         super().__init__(body_model(), landmarks)
         self.ground = ground
-        self.contacts = self.model.reach(*_contacts())  # [12, 10, 22, 3]
+        self.contacts = self.model.reach(*_contacts())  # [12, 34, 22, 3]
         precision, mean = self.prior.precision.copy(), self.prior.mean.copy()
         mean[0] = stature_m[0]
         precision[0, 0], precision[-1, -1] = stature_m[1] ** -2, ground.sigma_m**-2
