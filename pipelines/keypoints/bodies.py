@@ -141,7 +141,9 @@ def _bodies_of(
 ) -> tuple[Int64, float]:
     """Number the bodies [T, C, D] of a stretch of time, -1 for what is not usable, and learn its noise."""
     points = np.where(seen[..., None], views.xy, np.nan)
-    size = _sizes(points)
+    with np.errstate(invalid="ignore"):
+        away = points - known_median(points, axis=3)[..., None, :]
+        size = known_median(np.linalg.norm(away, axis=-1), axis=3)
     piece, count = _pieces(time_s, points, size)
     if not count:
         return piece, 1.0
@@ -179,13 +181,6 @@ def _bodies_of(
 
 
 # --- pieces --------------------------------------------------------------------------------------------
-
-
-def _sizes(points: Float) -> Float:
-    """Compute the median distance [T, C, D] of joints [T, C, D, J, 2] from their middle; NaN without any."""
-    with np.errstate(invalid="ignore"):
-        middle = known_median(points, axis=3)
-        return known_median(np.linalg.norm(points - middle[..., None, :], axis=-1), axis=3)
 
 
 def _shifts(now: Float, before: Float, size: Float, wait_s: Float) -> Float:

@@ -195,13 +195,8 @@ def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
         return max(cameras, key=lambda camera: len(camera.frame_t_ns)).frame_t_ns
     first = min(int(camera.frame_t_ns[0]) for camera in cameras)
     last = max(int(camera.frame_t_ns[-1]) for camera in cameras)
-    return regular_times(first, last, rate_hz)
-
-
-def regular_times(first_ns: int, last_ns: int, rate_hz: float) -> Int64:
-    """List the times of a rate from one time to another."""
-    steps = int((last_ns - first_ns) * rate_hz / 1e9) + 1
-    return first_ns + np.round(np.arange(steps) * (1e9 / rate_hz)).astype(np.int64)
+    steps = int((last - first) * rate_hz / 1e9) + 1
+    return first + np.round(np.arange(steps) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def candidates(cameras: list[Camera], between: Interpolation) -> Candidates:

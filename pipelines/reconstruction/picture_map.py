@@ -470,7 +470,10 @@ def _matched_pairs(
         database.write_frame(frame)
         database.write_keypoints(image.image_id, (found.xy * focal_px + middle).astype(np.float32))
         if not film:
-            described = pycolmap.FeatureDescriptors(type=sift, data=_rooted(found.descriptors))
+            # As COLMAP keeps them: square roots (RootSIFT, Arandjelović and Zisserman 2012).
+            sums = np.maximum(found.descriptors.sum(axis=1, keepdims=True, dtype=np.float32), 1)
+            rooted = (512 * np.sqrt(found.descriptors / sums)).round().clip(max=255).astype(np.uint8)
+            described = pycolmap.FeatureDescriptors(type=sift, data=rooted)
             database.write_descriptors(image.image_id, described)
         ids.append(image.image_id)
     for first, second in combinations(range(len(features)) if film else (), 2):
@@ -491,15 +494,6 @@ def _matched_pairs(
         pycolmap.match_sequential(path, matching, pairing, verifying)
     with pycolmap.Database.open(path) as verified:
         return int(verified.num_verified_image_pairs())
-
-
-def _rooted(descriptors: Picture) -> Picture:
-    """Return descriptors as COLMAP keeps them: square roots (RootSIFT, Arandjelović and Zisserman 2012)."""
-    sums = descriptors.sum(axis=1, keepdims=True, dtype=np.float32)
-    rooted: Picture = (
-        (512 * np.sqrt(descriptors / np.maximum(sums, 1))).round().clip(max=255).astype(np.uint8)
-    )
-    return rooted
 
 
 # --- laying a map on places ------------------------------------------------------------------------------
@@ -935,13 +929,6 @@ def _fitted(
     return start.moved(done.x), float(done.cost), slope.T @ slope
 
 
-def _middles(ray: Float) -> Float:
-    """Return the rays [..., 8, 3] of `MIDDLES` from those of `JOINED` [..., 15, 3]."""
-    sides = ([k for k, name in enumerate(JOINED) if name.endswith(part)] for part in MIDDLES)
-    middle = np.stack([ray[..., each, :].mean(axis=-2) for each in sides], axis=-2)
-    return np.asarray(middle / np.linalg.norm(middle, axis=-1, keepdims=True))
-
-
 def _paired(centre: Float, turn: Float, ray: Float, stature_m: float) -> tuple[_Placed, Float] | None:
     """Place two cameras by one person, rays [2, T, 8, 3], from several headings; and the sigmas."""
     from scipy.spatial.transform import Rotation
@@ -1024,7 +1011,9 @@ def join_maps(cameras: Sequence[PeopleSeen], t_ns: Int64, stature_m: float) -> J
     """
     seen = [camera.rays(t_ns) for camera in cameras]
     centre, turn = (np.stack([each[k] for each in seen]) for k in (0, 1))
-    middles = [_middles(each[2]) for each in seen]
+    sides = [[k for k, name in enumerate(JOINED) if name.endswith(part)] for part in MIDDLES]
+    middles = [np.stack([ray[..., own, :].mean(axis=-2) for own in sides], axis=-2) for _, _, ray, *_ in seen]
+    middles = [middle / np.linalg.norm(middle, axis=-1, keepdims=True) for middle in middles]
     count = len(cameras)
     pairs: dict[int, dict[int, tuple[Any, ...]]] = {c: {} for c in range(count)}
     for a, b in combinations(range(count), 2):

@@ -353,18 +353,13 @@ def _start_with_offsets(flight: RobustFlight, offset_s: Float) -> Float:
     return start
 
 
-def _unsettled(refined: Refined) -> Bool:
-    """Test which clocks [C] the estimate moved by more than counts."""
-    return np.abs(refined.clock_offset_s) > np.maximum(SETTLED_S, refined.clock_sigma_s)
-
-
 def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:
     """List clocks that the last estimate still moved."""
     return [
         f"refined: the clock of {camera.name} did not settle: the last of {1 + _MOST_SHIFTS} estimates still "
         f"moved it by {1e3 * abs(left):.1f} ms"
-        for camera, left, moves in zip(cameras, refined.clock_offset_s, _unsettled(refined), strict=True)
-        if refined.fallback is None and moves
+        for camera, left, sigma in zip(cameras, refined.clock_offset_s, refined.clock_sigma_s, strict=True)
+        if refined.fallback is None and abs(left) > max(SETTLED_S, sigma)
     ]
 
 

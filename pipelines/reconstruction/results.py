@@ -444,7 +444,8 @@ def write_figures(folder: Path, figures: Mapping[str, Any], description: Descrip
         joint_errors_table(figures["per_joint"], intervals_of["per_joint"]),
         JOINT_ERRORS,
     )
-    write_table(folder / "bones.parquet", _bones_table(shape["bones"]), BONES)
+    bones = [{"bone": name, **of} for name, of in shape["bones"].items()]
+    write_table(folder / "bones.parquet", pd.DataFrame(bones, columns=BONES.names), BONES)
     stored = {name: value for name, value in figures.items() if name != "per_joint"}
     stored["intervals"] = {name: value for name, value in intervals_of.items() if name != "per_joint"}
     stored["shape"] = {name: value for name, value in shape.items() if name != "bones"}
@@ -466,10 +467,6 @@ def joint_errors_table(
             low, high = intervals_of.get(joint, {}).get(name) or (None, None)
             rows.append((joint, name, value, low, high))
     return pd.DataFrame(rows, columns=JOINT_ERRORS.names)
-
-
-def _bones_table(bones: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    return pd.DataFrame([{"bone": name, **of} for name, of in bones.items()], columns=BONES.names)
 
 
 # Tables are larger than their arrays, and are made of so many times at once.
@@ -494,7 +491,9 @@ def skeleton_parts(observations: Observations, result: Triangulation) -> Iterato
         table[list(POINT_COVARIANCE_COLUMNS)] = result.covariance[rows][:, *np.triu_indices(3)]
         table["views"] = result.views[rows]
         used = np.where(result.inlier[rows], result.residual_px[rows], np.nan)
-        table["reprojection_px"] = _row_mean(used)
+        seen = np.sum(~np.isnan(used), axis=1)
+        mean = np.nansum(used, axis=1) / np.maximum(seen, 1)
+        table["reprojection_px"] = np.where(seen > 0, mean, np.nan)
         table["status"] = np.array(STATUS, dtype=object)[result.status[rows]]
         yield table
 
@@ -640,12 +639,6 @@ def poses_table(cameras: Sequence[Camera], poses: Sequence[tuple[Float, Float]])
         table[["qx", "qy", "qz", "qw"]] = quaternion_from_matrix(rotation[posed])
         parts.append(table)
     return pd.concat(parts, ignore_index=True)
-
-
-def _row_mean(values: Float) -> Float:
-    """Compute the mean of each row without its NaN; NaN for a row of only NaN."""
-    count = (~np.isnan(values)).sum(axis=1)
-    return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
 
 
 # Mean error over the root mean square that the covariances predict: quantiles 0.1, 0.5 and 0.9 over 180

@@ -273,7 +273,9 @@ def scene_of(
         since = (source.t_ns - flight.t_ns[0]).astype(np.float64)
         first = float(source.entry.frames.first_t_ns - flight.t_ns[0])  # few may have been looked at
         since = first + (since - first) * factor + late * 1e9
-        unposed.append(_outside(since + flight.t_ns[0], camera, flight.between))
+        logged = camera.camera.trajectory.t_ns - flight.t_ns[0]
+        beyond = np.maximum(logged[0] - since, since - logged[-1]) > flight.between.max_extrapolation_ns
+        unposed.append(float("nan") if camera.static else float(beyond.mean()))
         stated_ns[index] = first + (moments - late * 1e9 - first) / factor
         longest_ns = max(_LONGEST_GAP_NS, 1.5 * float(np.median(np.diff(since)))) if len(since) > 1 else 0
         since_ns, at_ns = np.rint(since).astype(np.int64), flight.t_ns - flight.t_ns[0]
@@ -292,13 +294,6 @@ def scene_of(
         np.array(unposed),
         stated_ns,
     )
-
-
-def _outside(t_ns: Float, camera: Filmed, between: Interpolation) -> float:
-    """Return the share of times before or after a camera's log; NaN of one that stands still."""
-    logged = camera.camera.trajectory.t_ns
-    beyond = np.maximum(logged[0] - t_ns, t_ns - logged[-1]) > between.max_extrapolation_ns
-    return float("nan") if camera.static else float(beyond.mean())
 
 
 def _poses(flight: Sampled) -> tuple[Float, Float]:

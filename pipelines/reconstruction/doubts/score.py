@@ -163,12 +163,6 @@ def _with_errors(scene: SceneOfMoments, errors: Float) -> SceneOfMoments:
     return replace(scene, rotation=turn @ scene.rotation, position=scene.position + errors[:, None, :3])
 
 
-def _constant_sigma(scene: SceneOfMoments) -> Float:
-    """Return the standard deviations [C, 6] of the constant errors."""
-    level = np.sqrt(np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0))
-    return np.repeat(np.maximum(level, _LEAST_SIGMA), 3, axis=1)
-
-
 def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Float]:
     """Return by how much rays miss joints [C, T, J, 3], over their depths, and the depths [C, T, J]."""
     toward = joints - position[:, :, None]
@@ -239,7 +233,8 @@ def _step(
     robust = np.where(sigmas > _HUBER * scale, _HUBER * scale / np.maximum(sigmas, 1e-12), 1.0)
     weight = np.where(used, robust / (variance * seen), 0.0)
     huber = np.where(sigmas > _HUBER, _HUBER * (2 * sigmas - _HUBER), sigmas**2)
-    sigma = _constant_sigma(scene)
+    level = np.sqrt(np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0))
+    sigma = np.repeat(np.maximum(level, _LEAST_SIGMA), 3, axis=1)
     placed, pull, extra = _placed(flight, solved)
     sized = size_sigmas(solved.joints)
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
@@ -389,19 +384,15 @@ def score(
     stature = median(statures)
     if np.isfinite(statures).sum() < 5 or not stature > 0:
         return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
-    odd = _rays(solved, good, misfit) | body.proportions(stature, _loose_scale(scene)) | body.posture()
+    pairs = combinations(scene.position, 2)
+    apart_m = np.max([np.linalg.norm(one - other, axis=-1) for one, other in pairs], axis=0)
+    loose = float(np.sqrt(2) * scene.sigma[:, 0].mean() / max(median(apart_m), 1e-9))  # share of the scale
+    odd = _rays(solved, good, misfit) | body.proportions(stature, loose) | body.posture()
     odd |= _place(flight, scene, body, solved, stature)
     odd = {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
     total += sum(surprise(each) for each in odd.values())
     odd |= {"behind": behind, "unposed": unposed(scene)}
     return Score(total, misfit, scatter, odd, stature, scene.person_px, float(good.mean()))
-
-
-def _loose_scale(scene: SceneOfMoments) -> float:
-    """Return by what share errors of positions change the scale of what cameras see between them."""
-    pairs = combinations(scene.position, 2)
-    apart_m = np.max([np.linalg.norm(one - other, axis=-1) for one, other in pairs], axis=0)
-    return float(np.sqrt(2) * scene.sigma[:, 0].mean() / max(median(apart_m), 1e-9))
 
 
 def surprise(odd: Oddity) -> float:

@@ -310,7 +310,9 @@ def memory_of(system: System, state: State) -> float:
         (mine,) = np.nonzero(pictures.camera == camera)
         order = mine[np.argsort(pictures.when_s[mine], kind="stable")]
         step_s = float(np.median(np.diff(pictures.when_s[order]))) if len(order) > 1 else 1.0
-        values = _evenly(pictures.when_s[order], own[order], step_s)
+        place = np.round((pictures.when_s[order] - pictures.when_s[order[0]]) / step_s).astype(np.int64)
+        values = np.full((int(place[-1]) + 1, *own.shape[1:]), np.nan)
+        values[place] = own[order]
         for lag in range(min(lags, len(values) - 1) + 1):
             product = values[: len(values) - lag] * values[lag:]
             products[lag] += np.nansum(product)
@@ -336,11 +338,3 @@ def memory_of_whole_error(memory: float, pixel_scale: float) -> float:
     points has (s^2 + (1 - s^2) tau) / N times the stated variance, where s^2 / N was counted.
     """
     return max(memory, 1.0 + (pixel_scale**-2 - 1.0) * memory)
-
-
-def _evenly(when_s: Float, values: Float, step_s: float) -> Float:
-    """Put values [F, ...] at their places in an even sequence; NaN where there is none."""
-    place = np.round((when_s - when_s[0]) / step_s).astype(np.int64)
-    even = np.full((int(place[-1]) + 1, *values.shape[1:]), np.nan)
-    even[place] = values
-    return even

@@ -143,7 +143,7 @@ def refine(
     0 for a known clock. Where a `prior` that was not `measured` does not explain the pictures, levels are
     estimated.
     """
-    part = _participating(start)
+    part = np.sum(~np.isnan(start[..., 0]), axis=0) >= _FEWEST_TIMES
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
         return _none(len(clock_sigma_s), start, "too few joints or times were triangulated")
     views = _RefinementInput(
@@ -222,11 +222,19 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
-        still = _without_slow_errors(system, state)
+        _, _, numbers = misfit(system, state._replace(white=np.zeros_like(state.white)))
+        pictures = system.problem.pictures
+        position, rotation = corrected(pictures.position, pictures.rotation, numbers)
+        still = replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
         own, state = _joints_without_slow_errors(still, state.position, known, measured=measured)
         covariance = _with_own(covariance, own, state)
     joints = state.position
-    fallback = doubts or _too_far(joints, views.start, prior.expected_m)
+    moved_m = float(np.median(np.linalg.norm(joints - views.start, axis=-1)))
+    fallback = doubts
+    if not doubts and moved_m > prior.expected_m:
+        fallback = (
+            f"the skeleton would move by {moved_m:.2f} m where the views let expect {prior.expected_m:.2f} m"
+        )
     as_logged = as_logged or prior.held_m > 0
     shift = np.median(views.start - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     return Refined(
@@ -263,21 +271,6 @@ def _spread_of(cameras: int) -> float:
     return float(np.sqrt(4.5 / cameras))
 
 
-def _without_slow_errors(system: System, state: State) -> Problem:
-    """Remove slow pose errors from the pictures' poses."""
-    pictures = system.problem.pictures
-    _, _, numbers = misfit(system, state._replace(white=np.zeros_like(state.white)))
-    position, rotation = corrected(pictures.position, pictures.rotation, numbers)
-    return replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
-
-
-def _white_only(problem: Problem, known: Knowledge) -> tuple[PoseErrors, ...]:
-    """Return the levels of pose errors where slow ones are removed."""
-    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
-    levels = [(errors, errors.white_with_stray(knot_s)) for errors in known.poses]
-    return tuple(PoseErrors((float(w[0]), float(w[1])), (), errors.logged) for errors, w in levels)
-
-
 def _joints_without_slow_errors(
     problem: Problem, start: Float, known: Knowledge, *, measured: bool
 ) -> tuple[tuple[System, System], State]:
@@ -289,7 +282,10 @@ def _joints_without_slow_errors(
 
     Returns a system of the same poses in which correlated keypoints count less again, and the estimate.
     """
-    known = replace(known, poses=_white_only(problem, known))
+    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
+    levels = [(*errors.white_with_stray(knot_s), errors.logged) for errors in known.poses]
+    poses = tuple(PoseErrors((float(m), float(rad)), (), logged) for m, rad, logged in levels)
+    known = replace(known, poses=poses)
     faster = 1.0 if measured else _FAST_MOTION**2  # kicks would be smoothed
     weighted = replace(known, memory=1.0, acceleration=faster * known.acceleration)
     initial = initial_state(problem, weighted, start)
@@ -348,12 +344,6 @@ def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, 
 
 
 # --- joints and bones ----------------------------------------------------------------------------------
-
-
-def _participating(start: Float) -> Bool:
-    """Choose the joints [J] that were triangulated often enough to be refined."""
-    part: Bool = (~np.isnan(start[..., 0])).sum(axis=0) >= _FEWEST_TIMES
-    return part
 
 
 def _of_joints(sighting: Sighting, part: Bool) -> Sighting:
@@ -683,14 +673,6 @@ def _apart(pictures: Pictures, position: Float) -> Float:
     centre = np.stack([position[pictures.camera == c].mean(axis=0) for c in np.unique(pictures.camera)])
     away: Float = centre - centre.mean(axis=0)
     return away
-
-
-def _too_far(position: Float, filled: Float, expected_m: float) -> str | None:
-    """Check the move of the skeleton; return the reason to refuse it if the views do not explain it."""
-    moved_m = float(np.median(np.linalg.norm(position - filled, axis=-1)))
-    if moved_m > expected_m:
-        return f"the skeleton would move by {moved_m:.2f} m where the views let expect {expected_m:.2f} m"
-    return None
 
 
 def _slow_sigma(system: System) -> float:
