@@ -120,10 +120,6 @@ class Trial:
         """Return the name of one camera, or `every camera`."""
         return self.names[group[0]] if len(group) == 1 < len(self.names) else "every camera"
 
-    def those(self, group: Sequence[int]) -> str:
-        """Return the name of one camera, or `all cameras`."""
-        return "all cameras" if len(group) == len(self.names) else self.names[group[0]]
-
     def groups(self, members: Sequence[int]) -> Iterator[tuple[list[int], float]]:
         """Take all cameras together, then each, which is dearer."""
         if len(members) > 1:
@@ -177,7 +173,7 @@ def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> A
     return Alternative(
         "frame_rate",
         trial.named(group),
-        f"the frame rate of {trial.those(group)} is {remedies.times_faster(factor)}",
+        f"the frame rate of {trial.whose(group)} is {1 / factor:.3g} times what is stated",
         remedies.frame_rate(trial.cameras, group, factor),
         price,
         trial.with_times(group, slower=factor),
@@ -201,7 +197,7 @@ def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
     return Alternative(
         "clock",
         trial.named(group),
-        f"the pictures of {trial.those(group)} were taken {remedies.earlier_or_later(late_s)}",
+        f"the pictures of {trial.whose(group)} were taken {remedies.earlier_or_later(late_s)}",
         remedies.clock(trial.cameras, group, late_s),
         1.0 + abs(late_s) / 2,
         trial.with_times(group, late_s),
@@ -313,7 +309,8 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
         what += f" the person is {stature:.3g} m tall"
         if of_poses and unit is not None:
             factor, code, evidence, cost = _UNITS_M[unit], "unit", {}, PRICE_OF_ALL
-            what, remedy = f"the positions are in {unit}", remedies.unit(trial.cameras, unit)
+            what = f"the positions are in {unit}"
+            remedy = remedies.pose(trial.cameras, trial.every, f"unit: {unit}")
         # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
         of_places = np.array([factor, 1.0] * 3)
         scene = replace(described, position=described.position * factor, sigma=described.sigma * of_places)
@@ -511,7 +508,7 @@ def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
     )
     exchanged = remedies.pose(cameras, moving, f"axes: {axes}")
     upside_down = remedies.pose(cameras, moving, remedies.upside_down)
-    inverted = remedies.pose(cameras, moving, remedies.inverse)
+    inverted = remedies.pose(cameras, moving, lambda poses: f"inverse: {str(not poses.inverse).lower()}")
     its_own = remedies.pose(cameras, moving, remedies.OF_CAMERA)
     the_body = remedies.pose(cameras, moving, remedies.OF_BODY)
     z = "up" if stated.z == "down" else "down"
@@ -604,7 +601,7 @@ def _keypoints(trial: Trial) -> Iterator[Alternative]:
                 f"the keypoints{whose} are of pictures {1 / factor:.3g} times as large",
                 remedies.keypoints_size(trial.cameras, group, 1 / factor),
                 0.0,
-                partial(_enlarged, factor=factor),
+                partial(lambda factor, pixels, _: pixels * factor, factor),
             )
             for factor in _SIZE_FACTORS
         ]
@@ -622,10 +619,6 @@ def _keypoints(trial: Trial) -> Iterator[Alternative]:
         for code, what, remedy, dearer, change in rows:
             scene = trial.with_pixels(group, change)
             yield Alternative(code, trial.named(group), what, remedy, price + dearer, scene)
-
-
-def _enlarged(pixels: Float, _: Filmed, factor: float) -> Float:
-    return pixels * factor
 
 
 # --- alternatives with numbers, which are fitted ---------------------------------------------------------
@@ -748,8 +741,7 @@ def _of_numbers(
     elif kind in ("shift", "north", "zero"):
         code, remedy = "origin", remedies.origin(cameras, group[0], shift, np.radians(degrees))
     elif kind == "heading":
-        turn = turn_about("z", degrees)
-        code, remedy = "pose", remedies.mount(cameras, group, before=turn)
+        code, remedy = "pose", _turned_about_vertical(trial, group, number)
     else:
         turn = turn_about("x" if kind == "pitch" else "z", degrees)
         code, remedy = "mount", remedies.mount(cameras, group, after=turn)
@@ -761,6 +753,14 @@ def _of_numbers(
         evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
     price = PRICE_OF_ONE if len(group) < len(trial.names) else _OF_ALL[kind]
     return Alternative(code, trial.named(group), what, remedy, price, evidence=evidence)
+
+
+def _turned_about_vertical(trial: Trial, group: Sequence[int], angle_rad: float) -> str:
+    """Turn mounts about the vertical as the cameras see it on average: they, and drones, are tilted."""
+    vertical = np.nansum(trial.described.rotation[:, :, 2], axis=1)
+    vertical /= np.maximum(np.linalg.norm(vertical, axis=1, keepdims=True), 1e-9)
+    turns = matrix_from_quaternion(quaternion_from_rotation_vector(angle_rad * vertical))
+    return "; ".join(remedies.mount(trial.cameras, [index], after=turns[index]) for index in group)
 
 
 def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:

@@ -50,11 +50,6 @@ def _rounded(rate: float) -> str:
     return f"{rate:.0f}" if abs(round(rate) - rate) < 0.005 * rate else f"{rate:.3f}"
 
 
-def times_faster(factor: float) -> str:
-    """State a frame rate beside the stated one, where pictures follow each other `factor` times as slowly."""
-    return f"{1 / factor:.3g} times what is stated"
-
-
 def earlier_or_later(seconds: float) -> str:
     """State by how much pictures were taken at another time than stated."""
     return f"{abs(seconds):.3f} s {'later' if seconds > 0 else 'earlier'} than stated"
@@ -122,7 +117,7 @@ def _rigid(translation: Sequence[float], rotation_xyzw: Float) -> str:
 
 
 def _vector(values: Sequence[float]) -> str:
-    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+    return "[" + ", ".join(f"{round(value, 3) + 0.0:.10g}" for value in values) + "]"
 
 
 def _as_words(rotation: Float, translation: Sequence[float]) -> str | None:
@@ -172,16 +167,11 @@ def _placed(camera: Filmed, shift: Float, turn: Float, factor: float = 1.0) -> s
     yaw_deg -= 360 * round(yaw_deg / 360)
     if np.abs(rotation[:2]).max() > _SAME:
         parts.append("rotation_xyzw: [" + ", ".join(f"{value:.5g}" for value in rotation) + "]")
-    elif abs(yaw_deg) > 0.05:
-        parts.append(f"yaw_deg: {yaw_deg:.1f}")
+    elif abs(yaw_deg) > 0.005:
+        parts.append(f"yaw_deg: {yaw_deg:.2f}")
     scale = float(f"{factor:.3g}") * stated.scale
     parts += [f"scale: {scale:.6g}"] if scale != 1 else []
     return f"pose.world_from_source: {{{', '.join(parts or ['translation: [0, 0, 0]'])}}}"
-
-
-def unit(cameras: Sequence[Filmed], name: str) -> str:
-    """State the unit of all cameras' positions."""
-    return _lines(cameras, range(len(cameras)), lambda _: f"pose.unit: {name}")
 
 
 def pose(cameras: Sequence[Filmed], group: Sequence[int], options: str | Callable[[PosesEntry], str]) -> str:
@@ -192,11 +182,6 @@ def pose(cameras: Sequence[Filmed], group: Sequence[int], options: str | Callabl
         return "pose." + stated.format(camera.name)
 
     return _lines(cameras, group, line)
-
-
-def inverse(poses: PosesEntry) -> str:
-    """State that poses are inverse to what they are read as."""
-    return f"inverse: {'false' if poses.inverse else 'true'}"
 
 
 def upside_down(poses: PosesEntry) -> str:

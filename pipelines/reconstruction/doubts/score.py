@@ -172,7 +172,10 @@ def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Fl
 
 
 def _by_errors(joints: Float, position: Float, direction: Float, missed: Float) -> Float:
-    """Return the derivatives [C, T, J, 3, 6] of the misses by each camera's shift and turn."""
+    """Return the derivatives [C, T, J, 3, 6] of misses by each camera's shift and turn.
+
+    Misses shrink with distance; only what their standard deviations do not shrink likewise is given.
+    """
     toward = joints - position[:, :, None]
     along = (toward * direction).sum(axis=-1)
     far = np.maximum(np.abs(along), _NEAR_M)[..., None, None]
@@ -223,9 +226,10 @@ def _step(
     times = used.shape[1]
     joints, place = np.nan_to_num(solved.joints), np.nan_to_num(scene.position)
     missed, far = _misses(joints, place, solved.direction)
-    varying2 = _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times)[:, None, None]
-    varying2 = varying2 + _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)[:, None, None] / far**2
-    variance = (pixel_variance(scene) / scene.focal_px**2)[:, None, None] + varying2
+    turned2 = pixel_variance(scene) / scene.focal_px**2
+    turned2 = (turned2 + _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times))[:, None, None]
+    moved2 = _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)[:, None, None]
+    variance = turned2 + moved2 / far**2
     sigmas = np.linalg.norm(missed, axis=-1) / np.sqrt(variance)
     # One picture is one observation: its keypoints err alike.
     seen = np.maximum(used.sum(axis=-1, keepdims=True), 1)
@@ -240,11 +244,13 @@ def _step(
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
     cost = float((np.where(used, huber, 0.0) / seen).sum()) + strain
 
-    parts = [_by_errors(joints, place, solved.direction, missed)]
+    # Farther away, errors of places are smaller angles: the misses and their standard deviations alike.
+    parts = [_by_errors(joints, place, solved.direction, missed * (turned2 / variance)[..., None])]
     for probe in _PROBE * np.eye(len(numbers)):
         probed = _with_errors(make(numbers + probe), errors)
         ray = np.where(used[..., None], _directions(probed), 0.0)
-        moved, _ = _misses(joints, np.nan_to_num(probed.position), ray)
+        moved, away = _misses(joints, np.nan_to_num(probed.position), ray)
+        moved *= np.sqrt(variance / (turned2 + moved2 / away**2))[..., None]
         parts.append((moved - missed)[..., None] / _PROBE)
     rows = np.concatenate([*parts, missed[..., None]], axis=-1) * np.sqrt(weight)[..., None, None]
     equations, moved = _normal_equations(rows, placed, pull)
