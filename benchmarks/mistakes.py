@@ -5,11 +5,11 @@
     python -m benchmarks.mistakes --corpus tuning|kept             # with real detectors on rendered pictures
     python -m benchmarks.mistakes --expected 42 [--seed 900]       # are expected errors right?
 
-Right flights (simulated, modelled keypoints) are described anew with one mistake each. A mistake counts if
-the error of the skeleton grows by more than 20 %, or nothing can be reconstructed. `named`: the first doubt
-has the right code. The remedy of the first doubt, right or wrong, is put into the manifest. `mended`: that
-brings the error back to within 10 % of the right one; `worse`: it raises the error, or the misfit that the
-doubt states. Every third of the right flights is of somebody who lies down or turns cartwheels.
+Right flights (modelled keypoints) are described anew with one mistake each. It counts if the error of the
+skeleton grows by more than 20 %, or nothing is reconstructed. `named`: the first doubt has the right code.
+Its remedy is put into the manifest. `mended`: that brings the error back to within 10 % of the right one;
+`worse`: it raises the error, or the misfit that the doubt states. `fitted`: it states poses with standard
+deviations; `true`: within two of these. Every third right flight is of somebody who lies or turns cartwheels.
 
 With --expected, modelled flights of several geometries are reconstructed by `auto`, with and without their
 pose noise in flight.yaml. Counted is how often the true error lies inside the 80 % interval of the verdict.
@@ -20,7 +20,7 @@ in the times of all pictures, which backgrounds alone can show. `--write` puts t
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -34,11 +34,13 @@ from benchmarks.corpus.stored import DETECTORS, HALVES, Flight, Half, flights
 from benchmarks.results import fixed, markdown_table, parser_of, show
 from pipelines.check import check
 from pipelines.detect import detect, follow
+from pipelines.geometry.poses import compose, invert, rotation_vector_from_quaternion
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
 from pipelines.session.stages import locked
+from pipelines.session.tables import POSES, read_table, trajectory_from
 from tests.synthetic.described_flights import (
     FLIGHTS,
     KEPT_ASIDE,
@@ -63,14 +65,16 @@ class Outcome(NamedTuple):
     named: bool  # by the first doubt
     remedied: bool  # the first doubt has a remedy
     mended: bool
+    fitted: bool
+    true: bool
     worse: bool
 
 
 def described(folder: Path, names: list[str], only: list[str], *, kept: bool, rare: bool) -> list[str]:
     """Make each mistake in each flight, print a line for each, and return the counts."""
-    by_drones: dict[int, list[Outcome]] = {}
+    drones: dict[int, list[Outcome]] = {}
     by_mistake: dict[str, list[Outcome]] = {}
-    print("| flight | mistake | error mm | first doubt | named | after the remedy mm |")
+    print("| flight | mistake | error mm | first doubt | named | remedied mm | off in sigmas |")
     for flight in KEPT_ASIDE if kept else FLIGHTS:
         if names and flight.name not in names:
             continue
@@ -80,62 +84,74 @@ def described(folder: Path, names: list[str], only: list[str], *, kept: bool, ra
         for mistake in LESS_USUAL if rare else MISTAKES:
             if mistake.fits(flight) and (not only or mistake.name in only):
                 outcome = tried(own, mistake, right or float("nan"))
-                by_drones.setdefault(flight.drones, []).append(outcome)
+                drones.setdefault(flight.drones, []).append(outcome)
                 by_mistake.setdefault(mistake.name, []).append(outcome)
     for name, found in by_mistake.items():
-        print(f"{name}: named, remedied, mended, worse of all: {' '.join(counted(found)[1:])}")
-    header = ["drones", "mistakes that count", "doubted", "named first", "remedies", "mended", "made worse"]
-    return markdown_table(header, [[str(n), *counted(found)] for n, found in sorted(by_drones.items())])
+        print(f"{name}: named, remedied, mended, fitted, true, worse of all: {' '.join(counted(found)[2:])}")
+    header = "drones, mistakes that count, doubted, named first, remedies, mended, fitted, true, made worse"
+    rows = [[str(n), *counted(each)] for n, each in sorted(drones.items())]
+    return markdown_table(header.split(", "), rows)
 
 
 def counted(found: Sequence[Outcome]) -> list[str]:
     """Count the mistakes that count, and what became of them; those that any remedy made worse."""
-    columns = list(zip(*(each for each in found if each.counts), strict=True)) or [()] * 6
+    columns = list(zip(*(each for each in found if each.counts), strict=True)) or [()] * 8
     return [*(str(sum(column)) for column in columns[:-1]), str(sum(each.worse for each in found))]
 
 
 def tried(own: Described, mistake: Mistake, right: float) -> Outcome:
     """Make a mistake, and return what became of it."""
-    compared = mistake.compared(own.flight)
-    if compared != "mpjpe_mm":
+    if (compared := mistake.compared(own.flight)) != "mpjpe_mm":
         right = measured(mistaken(own, None), compared)[0] or float("nan")
     manifest = mistaken(own, mistake.change)
     error, doubts, stopped = measured(manifest, compared)
     first = doubts[0] if doubts else None
-    named = first is not None and first["code"] in mistake.codes
+    named = bool(first and first["code"] in mistake.codes)
+    off: list[float] = []
     after, why, remedied = None, "", first is not None and with_remedy(manifest, first["remedy"])
-    if remedied:
+    if first and remedied:
         with patch("pipelines.reconstruct.doubts_of", lambda *_, **__: []):  # only the error is looked at
             after, _, why = measured(manifest, compared)
+        if compared == "mpjpe_mm" and after is not None:  # else the place is not known
+            off = off_sigmas(own, manifest.with_suffix(".session"), first["evidence"])
     mended = after is not None and after <= 1.1 * right
-    misfits = first["evidence"].get("tried", {}) if first else {}
-    raised = misfits.get("misfit_after", 0.0) > misfits.get("misfit_before", 0.0)
+    misfits = first["evidence"].get("tried") if first else None
+    raised = misfits is not None and misfits["misfit_after"] > misfits["misfit_before"]
     grown = remedied and error is not None and (after is None or after > 1.05 * error)
     worse = raised or (grown and not mended)
     counts = error is None or error > 1.2 * right
     verdict = ("yes" if named else "NO") if counts else f"({'yes' if named else 'no'})"
     said = f"{first['code']}: {first['what']}" if first else (stopped or "nothing")
-    row(own.flight.name, mistake.name, error, said, verdict, fixed(after) if after else why)
-    return Outcome(counts, first is not None, named, remedied, mended, worse)
+    row(own.flight.name, mistake.name, error, said, verdict, fixed(after) if after else why, off)
+    return Outcome(counts, bool(doubts), named, remedied, mended, bool(off), max(off, default=9) < 2, worse)
 
 
-def row(flight: str, mistake: str, error: float | None, said: str, named: str, after: str) -> None:
+def off_sigmas(own: Described, session: Path, evidence: dict[str, Any]) -> list[float]:
+    """Return how far stated poses are from the true ones, in the standard deviations of a remedy."""
+    off = []
+    for name, (_, right) in own.cameras.items():
+        track = trajectory_from(read_table(session / "cameras" / name / "poses.parquet", POSES))
+        moved, turned = compose(invert(*right), (track.position, track.quaternion_xyzw))
+        apart = (moved, np.degrees(rotation_vector_from_quaternion(turned)))
+        off.append([float(np.median(np.linalg.norm(each, axis=1))) for each in apart])
+    worst = dict(zip(("shift_sigma_m", "turn_sigma_deg"), np.max(off, axis=0), strict=True))
+    return [round(float(value) / evidence[key], 1) for key, value in worst.items() if evidence.get(key)]
+
+
+def row(flight: str, mistake: str, error: float | None, *cells: object) -> None:
     """Print a line of the table."""
-    print(f"| {flight} | {mistake} | {fixed(error)} | {said} | {named} | {after} |", flush=True)
+    print(f"| {flight} | {mistake} | {fixed(error)} |", *(f"{cell} |" for cell in cells), flush=True)
 
 
-def right_flights(folder: Path, seeds: Iterable[int]) -> list[str]:
+def right_flights(folder: Path, seeds: range) -> list[str]:
     """Check random right flights, print those that are doubted, and return the count."""
     doubted = []
-    count = 0
     for seed in seeds:
-        count += 1
         flight = acrobatic_flight(seed, folder) if seed % 3 == 0 else right_flight(seed)
-        doubts = check(mistaken(Described(flight, folder / flight.name), None)).doubts
-        if doubts:
+        if doubts := check(mistaken(Described(flight, folder / flight.name), None)).doubts:
             doubted.append(doubts[0].code)
             print(f"{flight}\n  {doubts[0].code}: {doubts[0].what} {doubts[0].evidence}", flush=True)
-    return markdown_table(["right flights", "doubted"], [[str(count), str(len(doubted))]])
+    return markdown_table(["right flights", "doubted"], [[str(len(seeds)), str(len(doubted))]])
 
 
 # --- expected errors ---------------------------------------------------------------------------------------
@@ -151,13 +167,12 @@ GEOMETRIES: dict[str, tuple[int, tuple[int, ...], tuple[float, float], tuple[flo
 """Drones that fly, those of them that film, and the ranges of radius (m) and tilt (deg)."""
 
 
-def expected_errors(folder: Path, seeds: Iterable[int]) -> list[str]:
+def expected_errors(folder: Path, seeds: range) -> list[str]:
     """Reconstruct flights of all geometries, print each, and count true errors inside the 80 % intervals."""
     inside: dict[str, list[bool]] = {}
     for seed in seeds:
         draw = np.random.default_rng(seed)
-        geometry = list(GEOMETRIES)[seed % len(GEOMETRIES)]
-        flown, filming, radius_m, tilt_deg = GEOMETRIES[geometry]
+        geometry, (flown, filming, radius_m, tilt_deg) = list(GEOMETRIES.items())[seed % len(GEOMETRIES)]
         formation = (
             f"{{radius_m: {draw.uniform(*radius_m):.1f}, tilt_deg: {draw.uniform(*tilt_deg):.0f},"
             f" yaw_deg: {draw.uniform(0, 360):.0f}, yaw_rate_deg_per_s: {draw.uniform(-10, 10):.1f}}}"
@@ -167,8 +182,7 @@ def expected_errors(folder: Path, seeds: Iterable[int]) -> list[str]:
         known = seed // len(GEOMETRIES) % 3  # the noise is stated, or only the log's own, or nobody's
         made = mistaken(own, None) if known == 2 else own.folder / "made" / "flight.yaml"
         document = YAML(typ="safe").load(made.read_text(encoding="utf-8"))
-        names = list(document["cameras"])
-        document["cameras"] = {names[index]: document["cameras"][names[index]] for index in filming}
+        document["cameras"] = dict(list(document["cameras"].items())[index] for index in filming)
         document["truth"] = "made/truth/joints.csv" if known == 2 else "truth/joints.csv"
         for camera in document["cameras"].values() if known else ():
             del camera["pose_noise"]
@@ -190,31 +204,18 @@ def expected_errors(folder: Path, seeds: Iterable[int]) -> list[str]:
     return markdown_table(["flights", "number", "true error inside the 80 % interval"], rows)
 
 
-# --- rendered flights ------------------------------------------------------------------------------------
-
-
-def _later(cameras: dict[str, Any], names: list[str], seconds: float) -> None:
-    for name in names:
-        cameras[name]["clock"]["offset_s"] += seconds
-
-
-def _slower(cameras: dict[str, Any], fps: float) -> None:
-    for camera in cameras.values():
-        camera["frame_times"]["fps"] = fps
-
-
-CORPUS_MISTAKES: dict[str, tuple[str, Callable[[dict[str, Any], float], None]]] = {
-    "none": ("", lambda _, __: None),
-    "clock 0.5 s, all": ("clock", lambda cameras, _: _later(cameras, list(cameras), 0.5)),
-    "clock 0.3 s, one": ("clock", lambda cameras, _: _later(cameras, list(cameras)[:1], 0.3)),
-    "30 for 24 Hz, all": ("frame_rate", lambda cameras, rate_hz: _slower(cameras, 1.25 * rate_hz)),
+CORPUS_MISTAKES: dict[str, tuple[str, int | None, float, float]] = {
+    "none": ("", 0, 0.0, 1.0),
+    "clock 0.5 s, all": ("clock", None, 0.5, 1.0),
+    "clock 0.3 s, one": ("clock", 1, 0.3, 1.0),
+    "30 for 24 Hz, all": ("frame_rate", None, 0.0, 1.25),
 }
-"""Codes, and changes of the cameras of flight.yaml, whose pictures come at a rate."""
+"""Codes, how many cameras (None: all) are late by seconds, and by which factor their pictures come faster."""
 
 
 def corpus(folder: Path, half: Half) -> list[str]:
     """Check the flights of the corpus, right and with mistakes in their times."""
-    counts: dict[tuple[str, bool], list[bool]] = {}
+    told: dict[tuple[str, bool], list[bool]] = {}
     for flight in flights([half]):
         if flight.missing_motions:
             continue
@@ -224,26 +225,28 @@ def corpus(folder: Path, half: Half) -> list[str]:
         for given in get_args(Given):
             with tempfile.TemporaryDirectory() as place:
                 drawn.session(Path(place) / "flight", 0, given, DETECTORS[0])
-                for mistake, (code, change) in CORPUS_MISTAKES.items():
+                for mistake, (code, *_) in CORPUS_MISTAKES.items():
                     if not code or (flight.with_pictures and given == "model"):
-                        doubts = _doubted(flight, Path(place) / "flight", mistake, change)
-                        first = doubts[0] if doubts else None
-                        said = f"{first.code}: {first.what}" if first else "nothing"
-                        named = bool(first and first.code == code) if code else bool(doubts)
-                        counts.setdefault((mistake, off), []).append(named)
+                        doubts = _doubted(flight, Path(place) / "flight", mistake)
+                        said = f"{doubts[0].code}: {doubts[0].what}" if doubts else "nothing"
+                        told.setdefault((mistake, off), []).append(
+                            bool(doubts) and code in ("", doubts[0].code)
+                        )
                         print(f"| {flight.name} | {given} | {mistake} | {said} |", flush=True)
     rows = [
         [mistake, "off" if off else "right", f"{sum(found)} of {len(found)}"]
-        for (mistake, off), found in counts.items()
+        for (mistake, off), found in told.items()
     ]
     return markdown_table(["mistake", "clocks", "named first (none: doubted)"], rows)
 
 
-def _doubted(
-    flight: Flight, place: Path, mistake: str, change: Callable[[dict[str, Any], float], None]
-) -> list[Doubt]:
+def _doubted(flight: Flight, place: Path, mistake: str) -> list[Doubt]:
+    _, some, late_s, faster = CORPUS_MISTAKES[mistake]
     document = YAML(typ="safe").load((place / "flight.yaml").read_text(encoding="utf-8"))
-    change(document["cameras"], flight.scenario.drones.camera.rate_hz)
+    for camera in list(document["cameras"].values())[:some]:
+        camera["clock"]["offset_s"] += late_s
+        if faster != 1:
+            camera["frame_times"]["fps"] = faster * flight.scenario.drones.camera.rate_hz
     session = place / f"{mistake}.session"
     ingest(written(document, place / f"{mistake}.yaml"), session)
     with kept_in_place_of_pictures(flight, DETECTORS[0]), locked(session) as writable:

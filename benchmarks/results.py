@@ -93,9 +93,11 @@ SECTIONS = (
         "Mistakes in flight.yaml",
         "Each flight is described with one mistake. It counts if the error grows by more than 20 %."
         " Named: the first doubt has the right code. Mended: its remedy brings the error within 10 % of"
-        " the right one. Made worse: a remedy, right or wrong, raises the error or the misfit.",
+        " the right one. Fitted: it states poses with standard deviations; true: within two of these. Made"
+        " worse: a remedy, right or wrong, raises the error or the misfit.",
         (
             Part("mistakes-kept", "Mistakes named and mended", MODELLED, KEPT),
+            Part("mistakes-kept-two", "Two drones", MODELLED, KEPT),
             Part("mistakes-tuned", "Mistakes named and mended", MODELLED, TUNED),
             Part("mistakes-film-kept", "Mistakes in the times of all pictures", RENDERED, KEPT),
             Part("mistakes-film-tuning", "Mistakes in the times of all pictures", RENDERED, TUNED),
