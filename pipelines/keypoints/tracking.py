@@ -213,19 +213,20 @@ class PeopleTracker:
             return person
         last = track.person.region
         turned = [replace(last, angle_rad=last.angle_rad + turn) for turn in _TURNS_RAD]
-        found = [other for other in self._locate(picture, turned) if other is not None]
+        others = [other.person for other in self._tracks if other is not track and other.missing < 2]
+        found = [new for new in self._locate(picture, turned) if new and not _are_bodies(new, others)]
         best = max(found, key=_score, default=None)
         if best is None or _score(best) < score + _SURER:
             return person
         self.counts["turned"] += 1
         (again,) = self._locate(picture, [best.region])
-        return max(again or best, best, key=_score)
+        return max(best, best if again is None or _are_bodies(again, others) else again, key=_score)
 
     def _merge(self) -> None:
         """Merge tracks on one body; the older one stays."""
         kept: list[_PictureTrack] = []
         for track in sorted(self._seen(), key=lambda track: track.number):
-            if any(_one_body(track.person, older.person) for older in kept):
+            if _are_bodies(track.person, [older.person for older in kept]):
                 self._tracks.remove(track)
                 self.counts["merged"] += 1
             else:
@@ -480,6 +481,11 @@ def _one_body(a: Person, b: Person) -> bool:
     if not distance.size:
         return False
     return float(np.median(distance)) < _ONE_BODY_SIDES * max(a.region.side, b.region.side)
+
+
+def _are_bodies(person: Person, others: Iterable[Person]) -> bool:
+    """Test if a person is one of several others, by `_one_body`."""
+    return any(_one_body(person, other) for other in others)
 
 
 def _is_part_of(candidate: FoundPerson, track: _PictureTrack) -> bool:

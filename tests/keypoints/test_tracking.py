@@ -45,9 +45,7 @@ def _assert_joints(found: TrackedPerson, truth: Bar) -> None:
 
 def test_people_keep_their_numbers_and_joints_while_they_walk() -> None:
     walks = [[Bar(200 + 3 * k, 200, 121), Bar(700 - 3 * k, 380, 151)] for k in range(60)]
-
     seen, tracker, _ = _run(draw(WIDTH, HEIGHT, *people) for people in walks)
-
     numbers = {round(person.person.region.side): person.track for person in seen[10]}
     assert sorted(numbers.values()) == [0, 1]
     for people, truth in zip(seen[10:], walks[10:], strict=True):
@@ -61,9 +59,7 @@ def test_people_keep_their_numbers_and_joints_while_they_walk() -> None:
 
 def test_somebody_small_in_4k_is_found_in_the_first_picture() -> None:
     truth = Bar(3100, 1700, 191)
-
     seen, _, networks = _run([draw(3840, 2160, truth)])
-
     (found,) = seen[0]
     _assert_joints(found, truth)
     assert len(networks.searched) <= 85
@@ -73,9 +69,7 @@ def test_somebody_small_in_4k_is_found_in_the_first_picture() -> None:
 def test_who_is_seen_again_at_the_place_is_the_same_person(gap: int, lost: int) -> None:
     again = Bar(480 + 40 * lost, 270 + 10 * lost, 121)
     shown = [Bar(480, 270, 121)] * 2 + [AWAY] * gap + [again] * 6
-
     seen, tracker, _ = _run(draw(WIDTH, HEIGHT, bar) for bar in shown)
-
     assert _tracks(seen)[2:] == [[]] * gap + [[0]] * 6 or lost
     assert _tracks(seen)[-1] == [0]
     assert (tracker.counts["lost"], tracker.counts["found again"], tracker.counts["found"]) == (lost, lost, 1)
@@ -86,9 +80,7 @@ def test_no_more_people_than_asked_for_but_the_actor_always() -> None:
     people = [Bar(100 + 150 * k, 270, 121) for k in range(5)]
     pictures = [draw(WIDTH, HEIGHT, *people)] * 40
     hints = [None] * 39 + [Hint((703.0, 270.0), 121.0, 20.0)]
-
     seen, tracker, _ = _run(pictures, hints, most_people=2, search_every=5)
-
     assert max(len(people) for people in seen) == 2
     assert tracker.counts["beyond the most"] > 0
     assert any(abs(person.person.region.centre[0] - 700) < 1 for person in seen[-1])
@@ -111,7 +103,6 @@ def test_a_tree_is_dropped_after_a_few_pictures_beside_a_person() -> None:
     tracker = PeopleTracker(networks := _Telling(), search_every=1)
 
     tracks = _tracks([tracker.step(picture, hints=[]) for picture in pictures])
-
     assert tracks[:6] == [[0], [0], [0, 1], [0, 1], [1], [1]]
     assert tracks[6:] == [[1]] * 36
     assert tracker.counts["no people"] > 1
@@ -169,15 +160,11 @@ class _Turning(BarNetworks):
     def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
         found = super().locate(picture, regions)
         left = [math.remainder(self.turn_rad - region.angle_rad, math.tau) for region in regions]
+        known = [(0.9, 0.6) if abs(rad) < math.pi / 4 else (0.5, 1.0) for rad in left]
+        turned = [self.turn_rad - rad * share for rad, (_, share) in zip(left, known, strict=True)]
         return [
-            replace(
-                one,
-                confidence=np.full(5, 0.9 if abs(rad) < math.pi / 4 else 0.5),
-                region=replace(
-                    one.region, angle_rad=self.turn_rad - rad * (0.6 if abs(rad) < math.pi / 4 else 1)
-                ),
-            )
-            for one, rad in zip(found, left, strict=True)
+            replace(one, confidence=np.full(5, sure), region=replace(one.region, angle_rad=turn))
+            for one, (sure, _), turn in zip(found, known, turned, strict=True)
         ]
 
 
@@ -191,13 +178,30 @@ def test_who_turns_over_is_followed(turns_deg: list[float]) -> None:
     assert tracker.counts["turned"] == (0.0 in turns_deg)
 
 
+@dataclass
+class _Beside(BarNetworks):
+    """Networks that take whoever is in a turned region for the one beside."""
+
+    person_confidence: float = 0.55
+
+    def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
+        beside = [replace(each, centre=(700.0, 270.0)) if each.angle_rad else each for each in regions]
+        found = super().locate(picture, beside)
+        return [replace(one, confidence=np.full(5, 0.9 if one.xy[0, 0] > 600 else 0.6)) for one in found]
+
+
+def test_nobody_is_taken_for_the_person_beside() -> None:
+    picture = draw(WIDTH, HEIGHT, Bar(500, 270, 121), Bar(700, 270, 121))
+    tracker = PeopleTracker(_Beside())
+    assert _tracks([tracker.step(picture, hints=[]) for _ in range(12)]) == [[0, 1]] * 12
+    assert not tracker.counts["turned"]
+
+
 def test_the_actor_alone_is_followed_and_the_whole_picture_not_searched() -> None:
     actor, bystander = Bar(700, 270, 121), Bar(200, 270, 121)
     pictures = [draw(WIDTH, HEIGHT, bystander, actor)] * 40
     hint = Hint((705.0, 265.0), 121.0, 30.0)
-
     seen, tracker, networks = _run(pictures, [hint] * 40, only_one=True)
-
     assert _tracks(seen) == [[0]] * 40
     _assert_joints(seen[-1][0], actor)
     # Two passes when found and one a picture; the square about the hint, and that again every ten pictures.
@@ -215,7 +219,6 @@ def test_each_logged_person_is_searched_until_they_are_seen() -> None:
     tracker = PeopleTracker(networks, search_every=1000)
 
     seen = [tracker.step(picture, hints=hints) for picture in pictures]
-
     assert _tracks(seen) == [[0], [0, 1], [0, 1], [0, 1]]
     _assert_joints(seen[1][1], ben)
     searched = len(networks.searched)
@@ -249,7 +252,6 @@ def _hint(x: float, y: float, z: float, sigma_m: float = 0.0, sigma_rad: float =
 
 def test_an_actor_ahead_is_in_the_middle_and_as_tall_as_the_range_says() -> None:
     hint = _hint(10, 0, 0, sigma_m=0.3, sigma_rad=math.radians(1))
-
     assert hint is not None
     assert hint.centre == pytest.approx((639.5, 359.5))
     assert hint.height_px == pytest.approx(800 * 1.75 / 10, rel=1e-3)
@@ -283,7 +285,6 @@ def test_a_body_of_a_third_of_a_tile_is_whole_in_one(
     body = side / 3
     x = body / 2 + place[0] * (width - body)
     y = body / 2 + place[1] * (height - body)
-
     assert any(_holds(tile, x, y, body) for tile in tiles(width, height) if tile.width == tile.height == side)
 
 
@@ -306,7 +307,6 @@ def test_people_are_found_once_and_in_the_pixels_of_the_whole_picture() -> None:
 @given(x=st.integers(40, 920), y=st.integers(40, 500))
 def test_small_people_are_found_by_tiles_and_not_in_the_whole(x: int, y: int) -> None:
     picture = draw(960, 540, Bar(x, y, 71))
-
     assert not find_in(BarNetworks(), picture, tiles(960, 540)[:1])
     best = find_in(BarNetworks(), picture, tiles(960, 540))[0]
     assert best.region.centre == pytest.approx((x, y), abs=0.5)
