@@ -49,7 +49,7 @@ CODES = {
     "out-of-memory": "the memory does not suffice",
     "outside-folder": "a relative path leads out of its folder",
     "place-unknown": "a place on Earth is not known, or cannot be brought into the world",
-    "special-file": "a pipe, a socket or a device",
+    "special-file": "a pipe, a socket, a device, or a large sparse file that is all but empty",
     "stated-twice": "one thing is stated more than once",
     "store-refused": "an object store refuses the credentials",
     "store-unreachable": "an object store does not answer",

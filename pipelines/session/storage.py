@@ -81,8 +81,10 @@ SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "http", "http
 
 _URL = re.compile(r"(?is)(?P<scheme>[a-z][a-z0-9+.-]+):(?P<chained>:.*:)?/+(?P<rest>[^/].*)")
 _IPV6 = re.compile(r"(?i)^\[[0-9a-f:.]+\]")
+# Each part between = & / is read once: backtracking took minutes for some texts of 10 kB.
 _SECRET = re.compile(
-    r"(?i)[?&#;][^=&/]*(sig|token|key|secret|credential|pass|pw|auth|jwt|code|\bsas\b)[^=&/]*(=|&|$)"
+    r"(?i)(?:(?:^|[=/])[^=&/?#;]*[?#;]|&)(?=[^=&/]*(?:[=&]|$))"
+    r"[^=&/]*(?:sig|token|key|secret|credential|pass|pw|auth|jwt|code|\bsas\b)"
 )
 
 
@@ -113,21 +115,23 @@ def is_special(path: Path) -> bool:
     """Return True for what may never end: a pipe, a socket, a device, a file of the kernel or of holes."""
     try:
         status = path.stat()
-        of_kernel = os.path.realpath(path).startswith(_OF_THE_KERNEL)
+        if os.path.realpath(path).startswith(_OF_THE_KERNEL):
+            return True
         if stat.S_ISREG(status.st_mode) and status.st_size > MIN_HOLLOW_BYTES and hasattr(os, "SEEK_HOLE"):
             with path.open("rb") as file:  # some file systems count no blocks, but tell no holes either
                 has_hole = os.lseek(file.fileno(), 0, os.SEEK_HOLE) < status.st_size
             return has_hole and status.st_blocks * 512 < MAX_HOLLOW_SHARE * status.st_size
     except (OSError, ValueError):  # missing, or an impossible name: the function that opens it reports this
         return False
-    return of_kernel or not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode))
+    return not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode))
 
 
 def refuse_special(path: Path) -> None:
     """Refuse, with a DataError, what `is_special`."""
     if is_special(path):
-        remedy = "write what comes out of it to a file, and name that"
-        raise DataError(path, "is a pipe, a socket, a device or full of holes", remedy, code="special-file")
+        problem = "is a pipe, a socket, a device, or a large sparse file that is all but empty"
+        remedy = "copy the file anew, or write what comes out of it to a file, and name that"
+        raise DataError(path, problem, remedy, code="special-file")
 
 
 def text_encoding(content: bytes) -> str:

@@ -174,7 +174,8 @@ def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Fl
 def _by_errors(joints: Float, position: Float, direction: Float, missed: Float) -> Float:
     """Return the derivatives [C, T, J, 3, 6] of misses by each camera's shift and turn.
 
-    Misses shrink with distance; only what their standard deviations do not shrink likewise is given.
+    Misses shrink with distance, and so do the parts of their standard deviations that come from places:
+    `missed` [C, T, J, 3] is the misses times the share of the variance that does not shrink.
     """
     toward = joints - position[:, :, None]
     along = (toward * direction).sum(axis=-1)
