@@ -147,9 +147,9 @@ def _read_here(path: Path, memory: int, cpu_s: int) -> dict[str, Any]:
 
     import pycolmap
 
-    with suppress(ValueError):  # of systems without such a limit
-        resource.setrlimit(resource.RLIMIT_AS, (memory, resource.RLIM_INFINITY))
-        resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
+    for limit, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, cpu_s)):
+        with suppress(ValueError):  # of systems without such a limit, and where less is allowed
+            resource.setrlimit(limit, (most, resource.getrlimit(limit)[1]))
     suffix = next(each for each in (".bin", ".txt") if _stored(path, each))
     with tempfile.TemporaryDirectory() as folder:
         copy, again = Path(folder) / "copy", Path(folder) / "again"
