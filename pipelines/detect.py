@@ -55,7 +55,7 @@ from pipelines.sources.pictures import CameraPictures, open_pictures, refuse_cha
 if TYPE_CHECKING:
     import pandas as pd
 
-DETECT = Stage("detect", revision=6)
+DETECT = Stage("detect", revision=7)
 DEFAULT_DETECTOR = "blazepose"
 
 BACKGROUND = Stage("background", revision=1)
