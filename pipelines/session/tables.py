@@ -423,7 +423,10 @@ def read_motion(path: Path, schema: pa.Schema, joints: tuple[str, ...] | None = 
 
 
 def load_bodies(bodies_path: Path, shapes_path: Path, around_ns: Int64 | None = None) -> list[MovingBody]:
-    """Load the bodies of two files, see `moving_bodies`; only with their times next to some, if stated."""
+    """Load the bodies of two files, see `moving_bodies`.
+
+    With `around_ns`, only the table's times next to these are loaded; all people must share their times.
+    """
     shapes = read_table(shapes_path, BODY_SHAPE)
     if around_ns is None:
         return moving_bodies(read_table(bodies_path, BODY), shapes)
