@@ -97,7 +97,6 @@ SECTIONS = (
         " worse: a remedy, right or wrong, raises the error or the misfit.",
         (
             Part("mistakes-kept", "Mistakes named and mended", MODELLED, KEPT),
-            Part("mistakes-kept-two", "Two drones", MODELLED, KEPT),
             Part("mistakes-tuned", "Mistakes named and mended", MODELLED, TUNED),
             Part("mistakes-film-kept", "Mistakes in the times of all pictures", RENDERED, KEPT),
             Part("mistakes-film-tuning", "Mistakes in the times of all pictures", RENDERED, TUNED),
