@@ -118,7 +118,8 @@ def _values(path: Path, value: object) -> Iterator[tuple[object, tuple[object, .
         if not waiting:
             return
         if visited > MAX_MERGED_ENTRIES:  # an alias of what it is within repeats it without end
-            raise DataError(path, "repeats values without end (&, *)", "mend it", code="too-large")
+            problem = f"repeats values (&, *) to more than {MAX_MERGED_ENTRIES:,}"
+            raise DataError(path, problem, "write them once", code="too-large")
         item, place = waiting.pop()
         yield item, place
         if isinstance(item, Mapping):
