@@ -24,10 +24,10 @@ from pipelines.simulation.flying import (
     fly,
     fly_with,
     frame_times,
+    log_times,
     moments,
     poses_at,
     ring_slots,
-    sample_log,
 )
 from pipelines.simulation.motion_script import perform
 from pipelines.simulation.raster import TriangleSurface, hidden_by
@@ -68,13 +68,19 @@ class SimulatedDrone:
 
 
 @dataclass(frozen=True)
-class SimulatedPerson:
-    """One person's part of a flight: the truth at the flight's moments T, and what was logged."""
+class Performer:
+    """A person who moves."""
 
     name: str
     look: Actor
     person: PosablePerson
-    moving: Moving  # at any seconds since the flight's start
+    moving: Moving  # the person's motion at seconds since the flight's start
+
+
+@dataclass(frozen=True)
+class SimulatedPerson(Performer):
+    """One person's part of a flight: the truth at the flight's moments T, and what was logged."""
+
     motion: BodyMotion  # at the moments T
     joints: Float  # [T, J, 3] m, of `person.joints`
     topic: str  # of the logged estimates
@@ -99,16 +105,6 @@ class SimulatedFlight:
     def moments_of(self, drone: SimulatedDrone) -> Int64:
         """Return the rows [F] of `t_ns` at which a drone took its pictures."""
         return np.searchsorted(self.t_ns, drone.at_frames.t_ns)
-
-
-@dataclass(frozen=True)
-class Performer:
-    """A person who moves."""
-
-    name: str
-    look: Actor
-    person: PosablePerson
-    moving: Moving  # the person's motion at seconds since the flight's start
 
 
 @dataclass(frozen=True)
@@ -390,7 +386,7 @@ def _drone(
     if not len(frames_ns):
         problem = f"{name} takes no picture within {scenario.duration_s:g} s at {lens_spec.rate_hz:g} Hz"
         raise DataError("duration_s", problem, "film longer, or more often", code="no-pictures")
-    at_log = sample_log(paths, index, drones.odometry_hz, span_s, np.random.default_rng([seed, _LOG, index]))
+    at_log = at(log_times(drones.odometry_hz, span_s, np.random.default_rng([seed, _LOG, index])))
     offsets = drones.clock_offsets_s
     return SimulatedDrone(
         name=name,

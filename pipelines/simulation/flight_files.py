@@ -297,20 +297,20 @@ class LoggedMessage(NamedTuple):
     fields: dict[str, Any]
 
 
-def logged_messages(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
-    """Yield the messages of one drone in the order of receipt; the first drone receives the actors, too."""
+def logged_messages(flight: SimulatedFlight, drone: SimulatedDrone) -> list[LoggedMessage]:
+    """Return the messages of one drone in the order of receipt; the first drone receives the actors, too."""
     messages = [*_odometry(flight, drone), *_gimbal(flight, drone), *_camera_infos(flight, drone)]
     if drone is flight.drones[0]:
         for person in flight.people:
             messages += _actor(flight, person)
-    for stamp_ns, topic, type_, fields in sorted(messages, key=lambda message: message[:2]):
-        yield LoggedMessage(stamp_ns + _RECEIVED_NS, topic, type_, fields)
+    return sorted(messages, key=lambda message: message[:2])
 
 
-_Stamped = tuple[int, str, str, dict[str, Any]]
+def _received(stamp_ns: int, topic: str, type_: str, fields: dict[str, Any]) -> LoggedMessage:
+    return LoggedMessage(stamp_ns + _RECEIVED_NS, topic, type_, fields)
 
 
-def _odometry(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Stamped]:
+def _odometry(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
     body = drone.log.body
     covariance = np.zeros((len(body.t_ns), 6, 6))
     if body.covariance is not None:  # ROS turns about fixed axes
@@ -322,18 +322,18 @@ def _odometry(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Stamp
             "child_frame_id": f"{drone.name}/body",
             "pose": {"pose": pose, "covariance": covariance[k]},
         }
-        yield stamp_ns, f"/{drone.name}/odometry", "nav_msgs/msg/Odometry", fields
+        yield _received(stamp_ns, f"/{drone.name}/odometry", "nav_msgs/msg/Odometry", fields)
 
 
-def _gimbal(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Stamped]:
+def _gimbal(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
     stamps = (drone.log.body.t_ns + flight.scenario.start_ns).tolist()
     for stamp_ns, attitude in zip(stamps, drone.log.gimbal_xyzw, strict=True):
         header = {"stamp": stamp_ns, "frame_id": "world"}
         fields = {"header": header, "quaternion": _xyzw(attitude)}
-        yield stamp_ns, f"/{drone.name}/gimbal", "geometry_msgs/msg/QuaternionStamped", fields
+        yield _received(stamp_ns, f"/{drone.name}/gimbal", "geometry_msgs/msg/QuaternionStamped", fields)
 
 
-def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Stamped]:
+def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
     lens = drone.intrinsics
     fields = {
         "width": lens.width,
@@ -346,16 +346,12 @@ def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_S
     }
     first, last = drone.log.body.t_ns[[0, -1]] + flight.scenario.start_ns
     for stamp_ns in range(int(first), int(last), _CAMERA_INFO_NS):
-        header = {"stamp": stamp_ns, "frame_id": f"{drone.name}/camera"}
-        yield (
-            stamp_ns,
-            f"/{drone.name}/camera/camera_info",
-            "sensor_msgs/msg/CameraInfo",
-            {"header": header, **fields},
-        )
+        stamped = {"header": {"stamp": stamp_ns, "frame_id": f"{drone.name}/camera"}, **fields}
+        topic = f"/{drone.name}/camera/camera_info"
+        yield _received(stamp_ns, topic, "sensor_msgs/msg/CameraInfo", stamped)
 
 
-def _actor(flight: SimulatedFlight, person: SimulatedPerson) -> Iterator[_Stamped]:
+def _actor(flight: SimulatedFlight, person: SimulatedPerson) -> Iterator[LoggedMessage]:
     sigma = person.look.estimate_sigma_m
     covariance = np.diag([sigma**2] * 3 + [0.0] * 3)
     for stamp_ns, place in zip(
@@ -366,7 +362,7 @@ def _actor(flight: SimulatedFlight, person: SimulatedPerson) -> Iterator[_Stampe
             "header": {"stamp": stamp_ns, "frame_id": "world"},
             "pose": {"pose": pose, "covariance": covariance},
         }
-        yield stamp_ns, person.topic, "geometry_msgs/msg/PoseWithCovarianceStamped", fields
+        yield _received(stamp_ns, person.topic, "geometry_msgs/msg/PoseWithCovarianceStamped", fields)
 
 
 def _xyz(vector: np.ndarray[Any, Any]) -> dict[str, float]:

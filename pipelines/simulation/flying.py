@@ -190,7 +190,7 @@ def fly_with(
         )
         since = (t_s[first : following + 1] - now)[:, None]
         moving = slot[:, None] + slot_velocity[:, None] * since
-        flight.advance(first, moving, np.broadcast_to(slot_velocity[:, None], moving.shape).copy())
+        flight.advance(first, moving, np.broadcast_to(slot_velocity[:, None], moving.shape))
     return flight.paths(aim)
 
 
@@ -213,24 +213,34 @@ class _Flight(NamedTuple):
         return cls(t_s, limits, positions, np.tile(allowed, rows), np.zeros_like(positions))
 
     def advance(self, first: int, slot: Float, slot_velocity: Float) -> None:
-        """Track slots [N, S, 3] from the moment `first` to the end of the slots."""
-        rows = slice(first, first + slot.shape[1])
-        _track(
-            self.t_s[rows],
-            np.ascontiguousarray(slot),
-            slot_velocity,
-            self.position[:, rows],
-            self.velocity[:, rows],
-            self.acceleration[:, rows],
-            self.limits,
-        )
+        """Track slots [N, S, 3] from the moment `first` to their end, and fill in the rows of the motion."""
+        kept = _BRAKING_SHARE * self.limits.acceleration_mps2
+        motion = (self.position, self.velocity, self.acceleration)
+        at, moving, pushed = (rows[:, first] for rows in motion)
+        for k in range(slot.shape[1] - 1):
+            steps, step_s = _substeps(self.t_s, first + k)
+            response = 1 - math.exp(-step_s / ATTITUDE_LAG_S)
+            for m in range(steps):
+                share = m / steps
+                missing = slot[:, k] + share * (slot[:, k + 1] - slot[:, k]) - at
+                distance = _length(missing)
+                wanted = slot_velocity[:, k] + share * (slot_velocity[:, k + 1] - slot_velocity[:, k])
+                towards = np.divide(_approach(distance, kept), distance, where=distance > 0, out=0 * distance)
+                wanted = _shortened(wanted + missing * towards, self.limits.speed_mps)
+                push = _shortened(VELOCITY_GAIN_PER_S * (wanted - moving), self.limits.acceleration_mps2)
+                pushed = pushed + response * (push - pushed)
+                faster = _shortened(moving + pushed * step_s, self.limits.speed_mps)
+                at = at + (moving + faster) * (step_s / 2)
+                pushed = (faster - moving) / step_s
+                moving = faster
+            for rows, reached in zip(motion, (at, moving, pushed), strict=True):
+                rows[:, first + k + 1] = reached
 
     def paths(self, aim: Float) -> DronePaths:
         """Compute the bodies' attitudes, which follow from the motion, and the cameras'."""
         away = aim - self.position
-        heading = _followed(
-            np.arctan2(away[..., 1], away[..., 0]), self.t_s, HEADING_LAG_S, HEADING_RATE_RADPS
-        )
+        ahead = np.arctan2(away[..., 1], away[..., 0])
+        heading = _followed(ahead, self.t_s, HEADING_LAG_S, HEADING_RATE_RADPS)
         thrust = self.acceleration + _DRAG_PER_S * self.velocity
         lift = np.maximum(thrust[..., 2] + _GRAVITY_MPS2, _LEAST_LIFT * _GRAVITY_MPS2)
         up = _unit(np.concatenate([thrust[..., :2], lift[..., None]], axis=-1))
@@ -250,7 +260,16 @@ class _Flight(NamedTuple):
 
 def _followed(angle: Float, t_s: Float, lag_s: float, fastest_radps: float) -> Float:
     """Compute angles [N, T] of something that turns after `angle` and starts there."""
-    return _follow(t_s, np.unwrap(angle, axis=1) if angle.size else angle, lag_s, fastest_radps)
+    target = np.unwrap(angle, axis=1) if angle.size else angle
+    followed = target.copy()
+    now = followed[:, 0] if len(t_s) else np.zeros(len(angle))
+    for k in range(len(t_s) - 1):
+        steps, step_s = _substeps(t_s, k)
+        for m in range(steps):
+            wanted = target[:, k] + m / steps * (target[:, k + 1] - target[:, k])
+            now = now + np.clip((wanted - now) / lag_s, -fastest_radps, fastest_radps) * step_s
+        followed[:, k + 1] = now
+    return followed
 
 
 def _unit(vectors: Float) -> Float:
@@ -284,50 +303,6 @@ def _approach(distance_m: Float, braking_mps2: float) -> Float:
     near = braking_mps2 / POSITION_GAIN_PER_S**2
     far = np.sqrt(np.maximum(2 * braking_mps2 * (distance_m - near / 2), 0.0))
     return np.where(distance_m <= near, POSITION_GAIN_PER_S * distance_m, far)
-
-
-def _track(
-    t_s: Float,
-    slot: Float,
-    slot_velocity: Float,
-    position: Float,
-    velocity: Float,
-    acceleration: Float,
-    limits: Limits,
-) -> None:
-    """Fly from the first row of the arrays [N, T, 3] of the motion, and write their other rows."""
-    kept = _BRAKING_SHARE * limits.acceleration_mps2
-    at, moving, pushed = position[:, 0], velocity[:, 0], acceleration[:, 0]
-    for k in range(len(t_s) - 1):
-        steps, step_s = _substeps(t_s, k)
-        response = 1 - math.exp(-step_s / ATTITUDE_LAG_S)
-        for m in range(steps):
-            share = m / steps
-            missing = slot[:, k] + share * (slot[:, k + 1] - slot[:, k]) - at
-            distance = _length(missing)
-            wanted = slot_velocity[:, k] + share * (slot_velocity[:, k + 1] - slot_velocity[:, k])
-            towards = np.divide(_approach(distance, kept), distance, where=distance > 0, out=0 * distance)
-            wanted = _shortened(wanted + missing * towards, limits.speed_mps)
-            push = _shortened(VELOCITY_GAIN_PER_S * (wanted - moving), limits.acceleration_mps2)
-            pushed = pushed + response * (push - pushed)
-            faster = _shortened(moving + pushed * step_s, limits.speed_mps)
-            at = at + (moving + faster) * (step_s / 2)
-            pushed = (faster - moving) / step_s
-            moving = faster
-        position[:, k + 1], velocity[:, k + 1], acceleration[:, k + 1] = at, moving, pushed
-
-
-def _follow(t_s: Float, target: Float, lag_s: float, fastest_radps: float) -> Float:
-    """Turn after angles [N, T] and start there."""
-    angle = target.copy()
-    now = angle[:, 0] if len(t_s) else np.zeros(len(angle))
-    for k in range(len(t_s) - 1):
-        steps, step_s = _substeps(t_s, k)
-        for m in range(steps):
-            wanted = target[:, k] + m / steps * (target[:, k + 1] - target[:, k])
-            now = now + np.clip((wanted - now) / lag_s, -fastest_radps, fastest_radps) * step_s
-        angle[:, k + 1] = now
-    return angle
 
 
 # --- recorders -----------------------------------------------------------------------------------------
@@ -398,13 +373,6 @@ def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
     )
     camera_position = position + rotate(body_xyzw, np.array(LEVER_ARM))
     return DronePoses(t_ns, position, body_xyzw, camera_position, camera_xyzw)
-
-
-def sample_log(
-    paths: DronePaths, drone: int, rate_hz: float, span_s: tuple[float, float], rng: np.random.Generator
-) -> DronePoses:
-    """Interpolate one drone's true poses at the stamps of its log (`log_times`)."""
-    return poses_at(paths, drone, log_times(rate_hz, span_s, rng))
 
 
 def estimate(truth: DronePoses, models: Sequence[NoiseModel], rng: np.random.Generator) -> PoseLog:

@@ -463,15 +463,14 @@ class Plan:
         duration_s = abs(angle) / _TURN_RATE * 1.4 + 0.3
         turn = (self.heading, self.heading + angle)
         stretch = Stretch(self.t_s, self.t_s + duration_s, None, None, self.place, turn)
-        self._step_through(
-            stretch, [(0.0, 0.0, 0.0)], first=LEFT if angle > 0 else RIGHT, least=_TURN_CADENCE
-        )
+        first = LEFT if angle > 0 else RIGHT
+        self._walk_steps(stretch, [(0.0, 0.0, 0.0)], first, None, least=_TURN_CADENCE)
 
     def travel(self, parts: Sequence[WayPart]) -> None:
         """Travel from a stand to a stand."""
         knots = pace(parts)
         stretch = self._along(parts, knots)
-        self._step_through(stretch, knots, first=RIGHT)
+        self._walk_steps(stretch, knots, RIGHT, None, least=_LAST_STEPS_CADENCE)
 
     def run_up(self, parts: Sequence[WayPart], speeds: Pace, plant_s: float, foot: int) -> None:
         """Run so that `foot` strikes `plant_s` after the start, its last step; the caller plans the rest."""
@@ -479,7 +478,7 @@ class Plan:
         knots = [knot for knot in speeds if knot[0] <= plant_s + 1e-9]
         count = max(2, round(float(self._phase(knots, 0.0)(np.array(plant_s)))))
         first = foot if count % 2 else 1 - foot
-        self._walk_steps(stretch, knots, first, count)
+        self._walk_steps(stretch, knots, first, count, least=0.0)
 
     def step(self, foot: int, lift_s: float, strike_s: float, at: tuple[Float, float], run: float) -> None:
         """Put a foot beside the body's future place: its place [2] in m and its heading in rad."""
@@ -499,7 +498,7 @@ class Plan:
         self.keys.add("running", *zip(self.t_s + times, running, strict=True))
         return Stretch(self.t_s, self.t_s + times[-1], way, along, self.place, (0.0, 0.0))
 
-    def _phase(self, knots: Sequence[tuple[float, float, float]], least: float) -> Curve:
+    def _phase(self, knots: Pace, least: float) -> Curve:
         """Return a function: steps since the start, by seconds since then."""
         from scipy.interpolate import CubicHermiteSpline
 
@@ -511,27 +510,13 @@ class Plan:
         began = float(phase(0.0))
         return lambda t_s: phase(t_s) - began
 
-    def _step_through(
-        self,
-        stretch: Stretch,
-        knots: Sequence[tuple[float, float, float]],
-        *,
-        first: int,
-        least: float = _LAST_STEPS_CADENCE,
-    ) -> None:
-        """Step until both feet stand under the body at the end of the stretch."""
-        self._walk_steps(stretch, knots, first, None, least=least)
-
     def _walk_steps(
-        self,
-        stretch: Stretch,
-        knots: Sequence[tuple[float, float, float]],
-        first: int,
-        count: int | None,
-        *,
-        least: float = 0.0,
+        self, stretch: Stretch, knots: Pace, first: int, count: int | None, *, least: float
     ) -> None:
-        """Plan the steps of a stretch: `count` of them up to the last knot, or until both feet stand."""
+        """Plan the steps of a stretch: `count` of them up to the last knot, or until both feet stand.
+
+        `first` is the foot of the first one, `least` the least cadence.
+        """
         rhythm = self._rhythm(stretch, knots, count, least)
         landed, number = 0, 0
         while (landed < 2) if count is None else (number < count):
@@ -553,9 +538,7 @@ class Plan:
         self.stretches.append(stretch)
         (self.place,), (self.heading,) = (values.copy() for values in stretch.at(np.array([stretch.end_s])))
 
-    def _rhythm(
-        self, stretch: Stretch, knots: Sequence[tuple[float, float, float]], count: int | None, least: float
-    ) -> _Rhythm:
+    def _rhythm(self, stretch: Stretch, knots: Pace, count: int | None, least: float) -> _Rhythm:
         """Compute the cadence from the speed; steps are shorter where it is steep."""
         phase = self._phase(knots, least)
         duration_s = stretch.end_s - stretch.start_s

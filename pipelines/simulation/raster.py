@@ -489,22 +489,15 @@ def sunlight(maps: Sequence[ShadowMap], axes: Float, fragments: Fragments, count
     towards = axes[2]
     sun = np.asarray(np.maximum(x * towards[0] + y * towards[1] + z * towards[2], 0.0), np.float32)
     for each in maps:
-        _cast(*each, axes, fragments.point, fragments.normal, sun)
+        _cast(each, axes, fragments, sun)
     return sun
 
 
 @cached
-def _cast(
-    height: Float32,
-    edge: Bytes,
-    corner: Float,
-    texel_m: float,
-    axes: Float,
-    point: Float32,
-    normal: Float32,
-    sun: Float32,
-) -> None:
+def _cast(shadow: ShadowMap, axes: Float, fragments: Fragments, sun: Float32) -> None:
     """Remove the light that one map shades: bilinear comparisons over 3 x 3 texels."""
+    height, edge, corner, texel_m = shadow
+    point, normal = fragments.point, fragments.normal
     rows, width = height.shape
     (ux, uy, uz), (vx, vy, vz), (wx, wy, wz) = axes
     per_m, u0, v0 = 1.0 / texel_m, corner[0] / texel_m + 0.5, corner[1] / texel_m + 0.5

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bytes, Float, Float32, Int32, Intrinsics
+from pipelines.geometry.arrays import Bytes, Float, Float32, Intrinsics
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.poses import matrix_from_quaternion
@@ -43,49 +43,27 @@ HAZE_M = 700.0
 
 
 def shade(
-    fragments: Fragments,
-    count: int,
-    sun: Float32,
-    sky: Float32,
-    first_row: int,
-    view: CameraView,
-    light: Float32,
+    fragments: Fragments, sun: Float32, sky: Float32, first_row: int, view: CameraView, light: Float32
 ) -> None:
-    """Write the light [R, W, 3] of a band's pixels, from the fragments' `sun` [N] and the share of `sky`."""
-    _fill_sky(sky, first_row, view.world_from_camera, view.pinhole, light)
-    _add(
-        fragments.pixel[:count],
-        fragments.share,
-        fragments.normal,
-        fragments.colour,
-        fragments.distance,
-        sun,
-        light.reshape(-1, 3),
-    )
+    """Write the light [R, W, 3] of a band's pixels, from the fragments' `sun` [N] and the share of `sky`.
 
-
-def _fill_sky(share: Float32, first_row: int, turn: Float, pinhole: Float, light: Float32) -> None:
-    """Fill in the sky: paler towards the horizon, and below it as at it; black where none is seen."""
+    The sky is paler towards the horizon, and below it as at it.
+    """
+    turn, pinhole = view.world_from_camera, view.pinhole
     rows, width, _ = light.shape
     down = (first_row + np.arange(rows)[:, None] - pinhole[3]) / pinhole[1]
     right = (np.arange(width) - pinhole[2]) / pinhole[0]
     dz = turn[2, 0] * right + turn[2, 1] * down + turn[2, 2]
     sine = np.maximum(dz / np.sqrt(right * right + down * down + 1.0), 0.0)
     low = ((1.0 - sine) * (1.0 - sine) * (1.0 - sine))[..., None]
-    light[:] = share[: rows * width].reshape(rows, width, 1) * (ZENITH_RGB + low * (HORIZON_RGB - ZENITH_RGB))
+    light[:] = sky[: rows * width].reshape(rows, width, 1) * (ZENITH_RGB + low * (HORIZON_RGB - ZENITH_RGB))
+    _add(fragments, sun, light.reshape(-1, 3))
 
 
 @cached
-def _add(
-    pixel: Int32,
-    share: Float32,
-    normal: Float32,
-    colour: Float32,
-    distance: Float32,
-    sun: Float32,
-    light: Float32,
-) -> None:
-    for i in range(len(pixel)):
+def _add(fragments: Fragments, sun: Float32, light: Float32) -> None:
+    pixel, share, _, _, normal, colour, distance, _ = fragments
+    for i in range(len(sun)):
         p = np.uint64(pixel[i])
         up = 0.5 + 0.5 * normal[i, 2]
         # A share of haze that needs no exponential: half at HAZE_M, all at the horizon.
@@ -138,36 +116,16 @@ def ground_texture(seed: int) -> GroundTexture:
     return GroundTexture(np.concatenate([level.ravel() for level in texels]), first.astype(np.int64), clipped)
 
 
-def paint(texture: GroundTexture, fragments: Fragments, count: int, view: CameraView) -> None:
+@cached
+def paint(texture: GroundTexture, fragments: Fragments, count: int, pixel_rad: float) -> None:
     """Multiply the colours of ground fragments by the texture, averaged over each fragment's footprint.
 
     A pixel's footprint on the ground is longer than it is wide. Mip maps (Williams, "Pyramidal
     parametrics", 1983) are square: their side is between the two, at least a third of the length.
     """
-    _paint(
-        *texture,
-        fragments.on_ground[:count],
-        fragments.point,
-        fragments.colour,
-        fragments.distance,
-        fragments.slant,
-        1 / view.pinhole[0],
-    )
-
-
-@cached
-def _paint(
-    texels: NDArray[np.uint32],
-    first: NDArray[np.int64],
-    site: Float32,
-    on_ground: Bytes,
-    point: Float32,
-    colour: Float32,
-    distance: Float32,
-    slant: Float32,
-    pixel_rad: float,
-) -> None:
-    for i in range(len(on_ground)):
+    texels, first, site = texture
+    _, _, on_ground, point, _, colour, distance, slant = fragments
+    for i in range(count):
         if on_ground[i] == 0:
             continue
         px, py = np.float64(point[i, 0]), np.float64(point[i, 1])
@@ -324,11 +282,6 @@ _CURVE_STEPS = 1024
 _BRIGHTEST = 4.0
 
 
-def developed(light: Float32, key: int) -> Bytes:
-    """Convert linear RGB light [H, W, 3] to BGR bytes; the same key (64 bits) gives the same noise."""
-    return _developed(light, np.uint64(key), _CURVE)
-
-
 def _curve() -> Float32:
     """Return 8-bit values by the square root of the exposed light: sRGB, with a soft shoulder above 0.8."""
     root = np.linspace(0.0, np.sqrt(_BRIGHTEST), _CURVE_STEPS)
@@ -343,7 +296,8 @@ _CURVE = _curve()
 
 
 @cached
-def _developed(light: Float32, key: np.uint64, curve: Float32) -> Bytes:
+def developed(light: Float32, key: np.uint64) -> Bytes:
+    """Convert linear RGB light [H, W, 3] to BGR bytes; the same key gives the same noise."""
     height, width, _ = light.shape
     picture = np.empty((height, width, 3), np.uint8)
     side, middle = np.float32(_SOFTNESS), np.float32(1 - 2 * _SOFTNESS)
@@ -371,7 +325,7 @@ def _developed(light: Float32, key: np.uint64, curve: Float32) -> Bytes:
                 for _ in range(4):
                     noise += np.int64(bits & np.uint64(31))
                     bits >>= np.uint64(5)
-                value = curve[at] + gain * np.float32(noise - 62) + np.float32(0.5)
+                value = _CURVE[at] + gain * np.float32(noise - 62) + np.float32(0.5)
                 picture[y, x, 2 - c] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
     return picture
 
@@ -515,9 +469,9 @@ class Renderer:
             band = empty_band(SUBROWS * len(rows), width)
             draw(triangles, chosen[start[k] : start[k + 1]], SHIFTS_PX, SUBROWS * first_row, band)
             count = gather(band, first_row, view, mesh, fragments, sky)
-            paint(self._texture, fragments, count, view)
+            paint(self._texture, fragments, count, 1 / self._intrinsics.fx)
             sun = sunlight(shadows, self._axes, fragments, count)
-            shade(fragments, count, sun, sky, first_row, view, rows)
+            shade(fragments, sun, sky, first_row, view, rows)
         return light[part.start - top : part.stop - top]
 
 
@@ -545,6 +499,6 @@ def _person_map(person: Mesh, axes: Float) -> ShadowMap:
     return shadow_map(person, person.vertices, axes, finest_m=_PERSON_TEXEL_M, most_texels=_PERSON_TEXELS)
 
 
-def _noise_key(seed: int, frame: int, position: Float) -> int:
+def _noise_key(seed: int, frame: int, position: Float) -> np.uint64:
     where = np.ascontiguousarray(position).view(np.uint32).tolist()
-    return int(np.random.SeedSequence([seed, frame, *where]).generate_state(1, np.uint64)[0])
+    return np.uint64(np.random.SeedSequence([seed, frame, *where]).generate_state(1, np.uint64)[0])

@@ -15,10 +15,10 @@ from pipelines.simulation.flying import (
     estimate,
     fly,
     frame_times,
+    log_times,
     moments,
     poses_at,
     ring_slots,
-    sample_log,
 )
 from pipelines.simulation.scenario import FormationSettings, Lens, Limits
 
@@ -80,7 +80,7 @@ def test_between_moments_poses_go_on_smoothly() -> None:
 @pytest.mark.parametrize("models", [[], [White(position_m=0.3, rotation_deg=1.0)]])
 def test_body_and_gimbal_make_the_camera(models: list[NoiseModel]) -> None:
     """As ingest composes them: the camera of the log, which is the true one without noise."""
-    truth = sample_log(PATHS, 0, 50.0, (0.0, 9.0), generator())
+    truth = poses_at(PATHS, 0, log_times(50.0, (0.0, 9.0), generator()))
     log = estimate(truth, models, generator(1))
     body, arm = (log.body.position, log.body.quaternion_xyzw), np.array(LEVER_ARM)
     forward = body_from_camera("forward")
