@@ -28,7 +28,7 @@ from pipelines.session.parallel import connected, local_cluster, result_of
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.registries import need
 from pipelines.session.stages import names_of
-from pipelines.session.storage import as_data_error, make_folder, read_json, url_of, write_whole
+from pipelines.session.storage import make_folder, on_disk, read_json, url_of, write_whole
 from pipelines.session.urls import as_urls, fetched, get, put, session_here
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
@@ -262,7 +262,7 @@ def _absolute(path: Path) -> Path:
 def _refuse_foreign(folder: Path, overwrite: bool) -> None:
     """Refuse to replace a table that is not the summary of a batch."""
     table = folder / _TABLE
-    try:
+    with on_disk(table):
         if overwrite:
             return
         if url := url_of(table):
@@ -272,8 +272,6 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
         else:
             with table.open(encoding="utf-8", errors="replace") as file:
                 first = file.readline()
-    except OSError as error:
-        raise as_data_error(error, table) from error
     if not first.startswith(",".join(COLUMNS[:4])):
         problem = "is not the summary of a batch"
         raise DataError(table, problem, "choose another --output, or give --overwrite", code="exists")
@@ -313,7 +311,7 @@ def _store(folder: Path, rows: Sequence[FlightRow]) -> None:
     for row in rows:
         cells = [*row.cells(), *(row.figures.get(arm) for arm in arms), len(row.warnings), row.report]
         writer.writerow(map(cell_text, cells))
-    try:
+    with on_disk(folder):
         for name, content in {_TABLE: text.getvalue(), _PAGE: render_flights(rows)}.items():
             encoded = content.encode("utf-8", "replace")
             if url := url_of(folder / name):
@@ -321,5 +319,3 @@ def _store(folder: Path, rows: Sequence[FlightRow]) -> None:
                 continue
             make_folder(folder)
             write_whole(folder / name, encoded)
-    except OSError as error:
-        raise as_data_error(error, folder) from error

@@ -459,19 +459,12 @@ def cameras_to_follow(description: Description) -> list[str]:
 
 
 @dataclass(frozen=True)
-class FollowedBlock:
+class FollowedBlock(Block):
     """Pictures of a camera that are followed together, by their numbers."""
 
-    camera: str
-    first: int  # row of the camera's frames with which it begins
     before: int | None  # last picture of the block before, to be shown first
     numbers: Int64
     stills: Int64  # those that are kept
-
-    @property
-    def name(self) -> str:
-        """A name by which blocks sort in time."""
-        return f"{self.camera}-{self.first:09d}"
 
 
 def follow_block(order: tuple[SharedSession, FollowedBlock]) -> dict[str, bytes]:
@@ -576,12 +569,12 @@ def _blocks_to_follow(
         stills = rows[np.round(chosen).astype(np.int64)]
     blocks = []
     for first in span[::BLOCK]:
-        begin, end = np.searchsorted(rows, (first, min(first + BLOCK, span.stop))).tolist()
+        stop = min(first + BLOCK, span.stop)
+        begin, end = np.searchsorted(rows, (first, stop)).tolist()
         own = rows[begin:end]
         before = int(numbers[rows[begin - 1]]) if begin and len(own) else None
-        blocks.append(
-            FollowedBlock(camera, first, before, numbers[own], numbers[np.intersect1d(own, stills)])
-        )
+        kept = numbers[np.intersect1d(own, stills)]
+        blocks.append(FollowedBlock(camera, first, stop, before, numbers[own], kept))
     return blocks
 
 

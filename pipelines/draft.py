@@ -79,7 +79,7 @@ from pipelines.session.registries import (
     TrajectoryFormat,
     VideoFormat,
 )
-from pipelines.session.storage import as_data_error, drop_link, is_folder
+from pipelines.session.storage import as_data_error, drop_link, is_folder, on_disk
 from pipelines.sources.attitudes import FilmOfCamera, turned_by_pictures
 from pipelines.sources.parts import CameraFrames
 from pipelines.sources.pictures import open_files
@@ -280,15 +280,13 @@ def _write(target: Path, text: str) -> str:
     temporary = target.with_name(f"{target.name}.new")
     drop_link(temporary)
     problem = ""
-    try:
+    with on_disk(target):
         temporary.write_text(text, encoding="utf-8", newline="\n")
         try:
             read_flight(temporary)
         except DataError as error:
             problem = error.problem
         temporary.replace(target)
-    except OSError as error:
-        raise as_data_error(error, target) from error
     return problem
 
 

@@ -37,9 +37,9 @@ from pipelines.session.stages import (
 )
 from pipelines.session.storage import (
     STUDY_MARK,
-    as_data_error,
     hash_of,
     is_made,
+    on_disk,
     read_json,
     refuse_special,
     sha256_of,
@@ -172,13 +172,11 @@ def compare_sessions(
 
 def _write_if_changed(page: Path, html: str) -> bool:
     """Write a page; return False if it is there already."""
-    try:
+    with on_disk(page):
         if page.is_file() and page.read_bytes() == html.encode():
             return False
         page.parent.mkdir(parents=True, exist_ok=True)
         write_whole(page, html.encode())
-    except OSError as error:
-        raise as_data_error(error, page) from error
     return True
 
 
@@ -197,10 +195,8 @@ def write_figures_of(
     session, or damaged; a table of it, or pictures, were changed; the folder cannot be written. BusyError:
     another process writes it.
     """
-    try:
+    with on_disk(target):
         refuse_foreign(target, overwrite=overwrite)
-    except OSError as error:
-        raise as_data_error(error, target) from error
     studied = [read_study(study) for study in studies]
     labels = _labels([folder.resolve() for folder in folders])
     sessions = {
@@ -268,11 +264,8 @@ def _refuse_foreign(page: Path, overwrite: bool) -> None:
     if overwrite or not page.exists():
         return
     refuse_special(page)
-    try:
-        with page.open("rb") as file:
-            is_ours = b'<meta name="generator" content="mocap' in file.read(2048)
-    except OSError as error:
-        raise as_data_error(error, page) from error
+    with on_disk(page), page.open("rb") as file:
+        is_ours = b'<meta name="generator" content="mocap' in file.read(2048)
     if not is_ours:
         remedy = "choose another place with --output, or write over it with --overwrite"
         raise DataError(page, "is there and is no page of mocap", remedy, code="exists")

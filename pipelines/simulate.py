@@ -29,6 +29,7 @@ from pipelines.session.storage import (
     hash_of,
     is_made,
     read_json,
+    refuse_others,
     sha256_of,
     whole_folder,
     write_json,
@@ -82,8 +83,8 @@ def simulate(
     key = _key(scenario, scenario_path, video)
     if not force and is_made(folder, key, mark=SIMULATION_MARK):
         return Simulated(folder, read_json(folder / SIMULATION_MARK), skipped=True)
-    if not overwrite:
-        _refuse_to_lose_others(folder)
+    if not overwrite and (folder / SIMULATION_MARK).is_file():  # such as a session of the earlier flight
+        refuse_others(folder, lambda name: any(fnmatch(name, own) for own in _OWN), "more than a flight")
     noise = noise_models(f"{scenario_path}: drones.pose_noise", scenario.drones.pose_noise)
     motions = recorded_motions(scenario, scenario_path)
     planner = _planner(scenario, scenario_path)
@@ -126,17 +127,6 @@ def simulate(
 def example_scenario(name: str) -> Path:
     """Return the scenario of an example that is installed with the program."""
     return Path(str(files("pipelines.simulation") / "data" / f"{name}.yaml"))
-
-
-def _refuse_to_lose_others(folder: Path) -> None:
-    """Refuse to replace a simulation with other files in its folder, such as a session of the old flight."""
-    if not (folder / SIMULATION_MARK).is_file():
-        return  # whole_folder checks folders that are no simulation
-    names = sorted(path.name for path in folder.iterdir())
-    if others := [name for name in names if not any(fnmatch(name, own) for own in _OWN)]:
-        problem = f"holds more than an earlier flight ({len(others)} entries, the first {others[0]})"
-        remedy = "move that away, choose another place with --output, or replace all of it with --overwrite"
-        raise DataError(folder, problem, remedy, code="exists")
 
 
 def _key(scenario: Scenario, path: Path, video: bool) -> str:

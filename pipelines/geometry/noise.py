@@ -74,22 +74,11 @@ class _RandomProcess(NoiseModel):
     def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
         """Draw the process of unit scale once, [T, 6]."""
 
-    def marginal_sigma(
-        self,
-        elapsed_s: Float,
-        speed_mps: Float,  # noqa: ARG002  # the base class's signature
-        turn_rate_radps: Float,  # noqa: ARG002
-    ) -> Float:
+    def marginal_sigma(self, elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float) -> Float:
         """Compute `NoiseModel.marginal_sigma`; motion has no influence."""
         return self._unit_sigma(elapsed_s)[:, None] * self._scale()
 
-    def errors(
-        self,
-        t_ns: Int64,
-        position: Float,  # noqa: ARG002  # the base class's signature
-        quaternion_xyzw: Float,
-        rng: np.random.Generator,
-    ) -> Float:
+    def errors(self, t_ns: Int64, position: Float, quaternion_xyzw: Float, rng: np.random.Generator) -> Float:
         """Draw `NoiseModel.errors`."""
         draw: Float = self._unit_draw((t_ns - t_ns[:1]) / 1e9, rng) * np.repeat(self._scale(), 3)
         if self.frame == "body":
@@ -172,22 +161,11 @@ class Latency(NoiseModel):
 
     latency_ms: float
 
-    def marginal_sigma(
-        self,
-        elapsed_s: Float,  # noqa: ARG002  # the base class's signature
-        speed_mps: Float,
-        turn_rate_radps: Float,
-    ) -> Float:
+    def marginal_sigma(self, elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float) -> Float:
         """Compute `NoiseModel.marginal_sigma`: the full error, which is along the motion, for every axis."""
         return np.stack([speed_mps, turn_rate_radps], axis=-1) * (self.latency_ms / 1e3)
 
-    def errors(
-        self,
-        t_ns: Int64,
-        position: Float,
-        quaternion_xyzw: Float,
-        rng: np.random.Generator,  # noqa: ARG002  # the base class's signature
-    ) -> Float:
+    def errors(self, t_ns: Int64, position: Float, quaternion_xyzw: Float, rng: np.random.Generator) -> Float:
         """Compute `NoiseModel.errors`; before the log begins, the camera is assumed to stand still."""
         delay_ns = round(self.latency_ms * 1e6)
         late_position, late_quaternion = interpolate_poses(

@@ -25,8 +25,7 @@ import pandas as pd
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.wording import cell_text, fixed, listing, shortened, significant
-from pipelines.session.errors import DataError
-from pipelines.session.storage import read_json, refuse_sessions, write_json
+from pipelines.session.storage import read_json, refuse_others, refuse_sessions, write_json
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -684,18 +683,10 @@ def write_drawing(folder: Path, name: str, figure: Figure) -> list[str]:
 def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
     """Refuse to write figures over sessions and, without `overwrite`, over anything that is not ours."""
     refuse_sessions(folder, mark=MARK, option="--figures")
-    if overwrite or not folder.exists():
+    if overwrite:
         return
-    if not folder.is_dir():
-        raise DataError(
-            folder, "is a file, not a folder", "name another place with --figures", code="not-a-folder"
-        )
     ours = {MARK}
     if (folder / MARK).is_file():
         stated = read_json(folder / MARK, "remove it, or name another folder with --figures").get("figures")
         ours |= {name for each in stated or () for name in each.get("files", ())}
-    foreign = sorted({path.name for path in folder.iterdir()} - ours)
-    if foreign:
-        problem = f"holds other files than figures ({len(foreign)}, the first {foreign[0]})"
-        remedy = "name another folder with --figures, or replace it with --overwrite"
-        raise DataError(folder, problem, remedy, code="exists")
+    refuse_others(folder, ours.__contains__, "other files than figures", option="--figures")

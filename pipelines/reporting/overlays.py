@@ -114,20 +114,16 @@ def collect_moments(
     moments = []
     for row in chosen:
         t_ns = int(motion.t_ns[row])
-        frames = [(camera, camera.nearest_frame(t_ns)) for camera in cameras]
-        moments.append(
-            OverlayMoment(
-                t_s=(t_ns - summary.origin_ns) / 1e9,
-                worst=row == worst,
-                error_mm=_largest_mm(summary.errors_mm, row),
-                views=tuple(
-                    _view(camera, at, motion, row, summary.origin_ns, read_frame)
-                    for camera, at in frames
-                    if at is not None
-                ),
-                without_frame=tuple(camera.name for camera, at in frames if at is None),
-            )
-        )
+        views, without_frame = list[OverlayView](), list[str]()
+        for camera in cameras:
+            if (at := camera.nearest_frame(t_ns)) is None:
+                without_frame.append(camera.name)
+                continue
+            (view,) = views_of(camera, np.array([at]), motion, motion.status[[row]], summary.origin_ns)
+            picture = None if read_frame is None else read_frame(view.camera, view.frame)
+            views.append(replace(view, picture=picture))
+        t_s, error_mm = (t_ns - summary.origin_ns) / 1e9, _largest_mm(summary.errors_mm, row)
+        moments.append(OverlayMoment(t_s, row == worst, error_mm, tuple(views), tuple(without_frame)))
     return tuple(moments)
 
 
@@ -344,18 +340,6 @@ def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens
     ]
     derivative = np.stack(columns, axis=-1) @ np.swapaxes(world_from_camera, -1, -2)
     return derivative @ full_covariance(covariance) @ np.swapaxes(derivative, -1, -2)
-
-
-def _view(
-    camera: FilmedCamera,
-    at: int,
-    motion: MeasuredMotion,
-    row: int,
-    origin_ns: int,
-    read_frame: ReadFrame | None,
-) -> OverlayView:
-    (view,) = views_of(camera, np.array([at]), motion, motion.status[[row]], origin_ns)
-    return view if read_frame is None else replace(view, picture=read_frame(view.camera, view.frame))
 
 
 def _longest_step_ns(motion: MeasuredMotion) -> int:

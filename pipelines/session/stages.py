@@ -30,7 +30,6 @@ from pipelines.session.errors import DataError, MocapError
 from pipelines.session.storage import (
     SCHEMA,
     NewerSchemaError,
-    as_data_error,
     drop_link,
     finished_part,
     hash_of,
@@ -38,8 +37,10 @@ from pipelines.session.storage import (
     is_special,
     jsonable,
     make_folder,
+    on_disk,
     read_json,
     refuse_newer,
+    refuse_others,
     refuse_special,
     remove_if_unused,
     remove_tree,
@@ -417,7 +418,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 def open_session(folder: Path) -> Session:
     """Open a session for reading; DataError: it is none, damaged, newer, or was interrupted."""
-    try:
+    with on_disk(folder):
         for stage in STAGES:
             new, old = _new_folder(folder, stage), _old(folder, stage)
             if (new / "stage.json").exists() and old.exists() and not (new.is_symlink() or old.is_symlink()):
@@ -425,8 +426,6 @@ def open_session(folder: Path) -> Session:
                 remedy = f"run `{COMMANDS[stage]}` again, which completes it"
                 raise DataError(folder, problem, remedy, code="not-a-session")
         _check_session(folder)
-    except OSError as error:
-        raise as_data_error(error, folder) from error
     return Session(folder)
 
 
@@ -446,11 +445,13 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
     DataError: not a session, or with `create` something else; of a later version; cannot be written.
     BusyError: another process holds it.
     """
-    try:
+    with on_disk(folder):
         is_new = create and not folder.exists()
         _refuse_newer_session(folder)
         if create:
-            _check_target(folder, overwrite=overwrite)
+            marks = ("ingest/stage.json", "ingest.new/stage.json")
+            if not (overwrite or any((folder / mark).is_file() for mark in marks)):
+                refuse_others(folder, _LEFT_BY_KILLED_INGEST.__contains__, "no session, but other files")
             make_folder(folder)
         elif not was_interrupted(folder):
             _check_session(folder)
@@ -473,8 +474,6 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
             finally:
                 if is_new and not (folder / "session.json").exists():
                     remove_if_unused(folder, _LOCK)
-    except OSError as error:
-        raise as_data_error(error, folder) from error
 
 
 def _check_session(folder: Path) -> None:
@@ -484,22 +483,6 @@ def _check_session(folder: Path) -> None:
         raise DataError(folder, problem, "make one with `mocap ingest FLIGHT.yaml`", code="not-a-session")
     remedy = "run `mocap ingest` again"
     refuse_newer(path, read_json(path, remedy), remedy)
-
-
-def _check_target(folder: Path, *, overwrite: bool) -> None:
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        problem = "is a file, not a folder"
-        raise DataError(folder, problem, "choose another place with --output", code="not-a-folder")
-    marks = ("ingest/stage.json", "ingest.new/stage.json")
-    if overwrite or any((folder / mark).is_file() for mark in marks):
-        return
-    foreign = sorted({path.name for path in folder.iterdir()} - _LEFT_BY_KILLED_INGEST)
-    if foreign:
-        problem = f"is not a session and not empty ({len(foreign)} entries, the first {foreign[0]})"
-        remedy = "choose another place with --output, or write into it with --overwrite"
-        raise DataError(folder, problem, remedy, code="exists")
 
 
 def _refuse_newer_session(folder: Path) -> None:
@@ -599,7 +582,7 @@ _ORIGIN = "copied_from.json"
 def copy_session(folder: Path, target: Path) -> None:
     """Copy a session without its videos, so that stages can run on it; a copy of it already is kept."""
     record = open_session(folder).ingested()
-    try:
+    with on_disk(target):
         if (target / _ORIGIN).is_file():
             stated = read_json(target / _ORIGIN, "choose another --output")
             if stated == {"session": str(origin_of(folder).resolve()), "ingest": record.key}:
@@ -617,8 +600,6 @@ def copy_session(folder: Path, target: Path) -> None:
                 path.chmod(path.stat().st_mode | stat.S_IWUSR)
         write_json(new / _ORIGIN, {"session": str(origin_of(folder).resolve()), "ingest": record.key})
         new.rename(target)
-    except OSError as error:
-        raise as_data_error(error, target) from error
 
 
 def _copy_file(source: str, target: str) -> None:

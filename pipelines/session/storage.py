@@ -58,6 +58,15 @@ def as_data_error(error: OSError, path: Path) -> DataError:
     return DataError(error.filename or path, error.strerror or str(error), remedy, code=code)
 
 
+@contextmanager
+def on_disk(path: Path) -> Iterator[None]:
+    """Make errors of the operating system within it those of `as_data_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise as_data_error(error, path) from error
+
+
 def refuse_names(names: Collection[str], of: Literal["camera", "person"]) -> None:
     """Refuse, with a ValueError, names that cannot be of files each, or that unnamed people have."""
     for name in names:
@@ -165,7 +174,7 @@ def sha256_of(path: Path) -> str:
     Empty folders and the content of linked folders are ignored. DataError if something cannot be read.
     """
     refuse_special(path)
-    try:
+    with on_disk(path):
         if not is_folder(path):
             return _file_digest(path).hex()
         digest = hashlib.sha256()
@@ -173,18 +182,14 @@ def sha256_of(path: Path) -> str:
             # Zero byte after the name, a digest of fixed length: no two folders run together.
             digest.update(os.fsencode(name) + b"\0" + _file_digest(file))
         return digest.hexdigest()
-    except OSError as error:
-        raise as_data_error(error, path) from error
 
 
 def file_stamp(path: Path) -> str:
     """Hash sizes and times of change of a file, or a folder's files: unchanged if nothing was written."""
-    try:
+    with on_disk(path):
         if not is_folder(path):
             return hash_of(_size_and_change(path))
         return hash_of([[name, *_size_and_change(file)] for name, file in sorted(_files(path))])
-    except OSError as error:
-        raise as_data_error(error, path) from error
 
 
 def _size_and_change(path: Path) -> list[int]:
@@ -461,27 +466,25 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
     a DataError. BusyError if another process makes the same folder.
     """
     target = target.absolute()
-    _check(target, mark, overwrite)
-    try:
-        with working_folder(_work_of(target), target) as work:
-            _put_back(work, target)
-            for stale in [path for path in work.iterdir() if path.is_dir() and path.name != key]:
-                remove_tree(stale)
-            making = Making(work, target, key)
-            making.folder.mkdir()
-            try:
-                yield making
-            except DataError:
-                remove_tree(work / key)  # the user will change an input
-                raise
-            else:
-                remove_tree(work / key)
-            finally:
-                with suppress(OSError):
-                    _put_back(work, target)
-                    remove_tree(work / "whole")
-    except OSError as error:
-        raise as_data_error(error, target) from error
+    if not (overwrite or (target / mark).is_file()):
+        refuse_others(target, lambda _: False, "something else")
+    with on_disk(target), working_folder(_work_of(target), target) as work:
+        _put_back(work, target)
+        for stale in [path for path in work.iterdir() if path.is_dir() and path.name != key]:
+            remove_tree(stale)
+        making = Making(work, target, key)
+        making.folder.mkdir()
+        try:
+            yield making
+        except DataError:
+            remove_tree(work / key)  # the user will change an input
+            raise
+        else:
+            remove_tree(work / key)
+        finally:
+            with suppress(OSError):
+                _put_back(work, target)
+                remove_tree(work / "whole")
 
 
 def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
@@ -494,6 +497,21 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
             raise DataError(target, problem, f"name another folder with {option}")
     if not (target / mark).is_file():
         refuse_inside_session(target, option)
+
+
+def refuse_others(
+    target: Path, is_ours: Callable[[str], bool], held: str, *, option: str = "--output"
+) -> None:
+    """Refuse, with a DataError, to replace a file, or a folder that has a name in it which is not ours."""
+    if not target.exists():
+        return
+    if not target.is_dir():
+        remedy = f"choose another place with {option}"
+        raise DataError(target, "is a file, not a folder", remedy, code="not-a-folder")
+    if others := sorted(path.name for path in target.iterdir() if not is_ours(path.name)):
+        problem = f"holds {held} ({len(others)} entries, the first {others[0]})"
+        remedy = f"choose another place with {option}, or write over it with --overwrite"
+        raise DataError(target, problem, remedy, code="exists")
 
 
 def refuse_inside_session(target: Path, option: str) -> None:
@@ -522,18 +540,6 @@ def is_made(target: Path, key: str, *, mark: str) -> bool:
 
 def _work_of(target: Path) -> Path:
     return target.parent / f".{target.name}.making"
-
-
-def _check(target: Path, mark: str, overwrite: bool) -> None:
-    if overwrite or not target.exists() or (target / mark).is_file():
-        return
-    if not target.is_dir():
-        problem = "is a file, not a folder"
-        raise DataError(target, problem, "choose another place with --output", code="not-a-folder")
-    if entries := sorted(path.name for path in target.iterdir()):
-        problem = f"holds something else ({len(entries)} entries, the first {entries[0]})"
-        remedy = "choose another place with --output, or replace it with --overwrite"
-        raise DataError(target, problem, remedy, code="exists")
 
 
 def _put_back(work: Path, target: Path) -> None:

@@ -22,10 +22,10 @@ from pipelines.session.errors import DataError, MocapError
 from pipelines.session.registries import need
 from pipelines.session.stages import first_place_of, origin_of
 from pipelines.session.storage import (
-    as_data_error,
     hash_of,
     held,
     is_folder,
+    on_disk,
     read_json,
     remove_tree,
     sha256_of,
@@ -109,7 +109,7 @@ def fetched(url: str, *, fresh: bool = False) -> Path:
     """Return the copy of a file or folder of a store, fetched if missing or, if `fresh`, changed."""
     folder = _cache() / "sources" / _short(url)
     target, note = folder / url.rpartition("/")[2], folder.with_suffix(".json")
-    with _own_disk(folder):
+    with on_disk(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(folder.with_suffix(".lock")):  # others wait, and find it there
             known = _noted(note) if target.exists() else {}
@@ -182,10 +182,10 @@ def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
         return
     folder = _cache() / "sessions" / _short(url) / url.rpartition("/")[2]
     note = folder.parent.with_suffix(".json")
-    with _own_disk(folder):
+    with on_disk(folder):
         note.parent.mkdir(parents=True, exist_ok=True)
     with held(folder.parent.with_suffix(".lock"), url):
-        with _own_disk(folder):
+        with on_disk(folder):
             before = None  # what an earlier command left has to be uploaded
             if not folder.exists():
                 files = _session_at(url)
@@ -199,7 +199,7 @@ def session_here(place: Path | str, *, create: bool = False) -> Iterator[Path]:
                 before = _digests(folder)
             write_json(note, {"url": url})
         yield folder
-        with _own_disk(folder):
+        with on_disk(folder):
             digests = _digests(folder)
             if "session.json" in digests and digests != before:
                 _asked(url, lambda store, path: _replace(store, path, folder, list(digests)))
@@ -230,14 +230,6 @@ def _replace(store: Any, path: str, folder: Path, names: list[str]) -> None:
     if store.exists(path):
         store.rm(path, recursive=True)
     store.put([str(folder / name) for name in names], [f"{path}/{name}" for name in names])
-
-
-@contextmanager
-def _own_disk(place: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise as_data_error(error, place) from error
 
 
 def put(url: str, content: bytes) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 from pipelines.formats.calibrations.camera_matrices import (
     describe_cameras,
     intrinsics,
-    invert_matrix,
-    invert_rodrigues,
+    invert_pose,
     unstated_size,
 )
 from pipelines.formats.common.files import TextFormat, numbers, read_yaml
@@ -84,9 +83,8 @@ def _placed(
     path: Path, name: str, camera: CalibratedCamera, rotation: Float, translation: Float
 ) -> CalibratedCamera:
     """Add a pose camera_from_world: a rotation vector, or a matrix, and a translation."""
-    invert = invert_rodrigues if rotation.size == 3 else invert_matrix
     rotation = rotation.ravel() if rotation.size == 3 else rotation
-    position, quaternion_xyzw = invert(path, name, rotation, translation.ravel())
+    position, quaternion_xyzw = invert_pose(path, name, rotation, translation.ravel())
     return replace(camera, position=position, quaternion_xyzw=quaternion_xyzw)
 
 

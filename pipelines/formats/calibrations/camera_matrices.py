@@ -70,40 +70,26 @@ def build_intrinsics(
         raise damaged(source, f"camera {camera}: {error}") from error
 
 
-def invert_pose(source: Path, camera: str, quaternion_xyzw: Float, translation: Float) -> tuple[Float, Float]:
-    """Return position [3] and quaternion [4] of world_from_camera, given camera_from_world."""
+def invert_pose(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
+    """Return position [3] and quaternion [4] of world_from_camera, given camera_from_world.
+
+    The rotation is a quaternion [4] xyzw, a vector [3] (Rodrigues, rad) or a matrix [3, 3].
+    """
     from scipy.spatial.transform import Rotation
 
-    numbers = np.concatenate([quaternion_xyzw, translation])
-    # NaN fails the comparison too.
-    usable = numbers.shape == (7,) and bool((np.abs(numbers) < _LARGEST).all())
-    if not usable or np.linalg.norm(quaternion_xyzw) < 1e-9:
+    # NaN fails the comparisons, too.
+    usable = translation.shape == (3,) and bool((np.abs(translation) < _LARGEST).all())
+    usable &= bool((np.abs(rotation) < _LARGEST).all())
+    quaternion_xyzw = rotation
+    if rotation.shape == (3,):
+        quaternion_xyzw = Rotation.from_rotvec(rotation).as_quat() if usable else np.zeros(4)
+    elif rotation.shape == (3, 3):
+        usable &= np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+        quaternion_xyzw = Rotation.from_matrix(rotation).as_quat() if usable else np.zeros(4)
+    if not usable or quaternion_xyzw.shape != (4,) or np.linalg.norm(quaternion_xyzw) < 1e-9:
         raise DataError(source, f"camera {camera}: its rotation and translation are no pose")
     world_from_camera = Rotation.from_quat(quaternion_xyzw).inv()
     return -world_from_camera.apply(translation), world_from_camera.as_quat()
-
-
-def invert_rodrigues(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
-    """Apply `invert_pose` to a rotation vector [3] (Rodrigues, rad)."""
-    from scipy.spatial.transform import Rotation
-
-    if rotation.shape != (3,) or not (np.abs(rotation) < _LARGEST).all():
-        raise DataError(source, f"camera {camera}: its rotation is no vector of three numbers")
-    return invert_pose(source, camera, Rotation.from_rotvec(rotation).as_quat(), translation)
-
-
-def invert_matrix(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
-    """Apply `invert_pose` to a rotation matrix [3, 3]."""
-    from scipy.spatial.transform import Rotation
-
-    is_rotation = (
-        rotation.shape == (3, 3)
-        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-        and np.linalg.det(rotation) > 0
-    )
-    if not is_rotation:
-        raise DataError(source, f"camera {camera}: R is not a rotation matrix")
-    return invert_pose(source, camera, Rotation.from_matrix(rotation).as_quat(), translation)
 
 
 def describe_cameras(cameras: dict[str, CalibratedCamera]) -> dict[str, object]:

@@ -10,10 +10,10 @@ import numpy as np
 from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
 from pipelines.session.storage import (
-    as_data_error,
     bad_value,
     damaged,
     is_special,
+    on_disk,
     plain_text,
     read_text,
     refuse_special,
@@ -30,10 +30,8 @@ _LARGEST_YAML = 1 << 20
 def read_bytes(path: Path) -> bytes:
     """Read the whole file."""
     refuse_special(path)
-    try:
+    with on_disk(path):
         return path.read_bytes()
-    except OSError as error:
-        raise as_data_error(error, path) from error
 
 
 def first_bytes(path: Path, count: int = HEAD_BYTES, *, suffixes: Collection[str] = ()) -> bytes:

@@ -39,7 +39,7 @@ from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
-from pipelines.session.storage import damaged
+from pipelines.session.storage import damaged, on_disk
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log
 # A log defines up to 256 types, and chance makes one definition in 16 MB.
@@ -322,15 +322,13 @@ class _DataFlash:
 
 def _index(path: Path) -> Any:
     """Return pymavlink's reader, which lists the position of each message in the file."""
-    try:
+    with on_disk(path):
         with path.open("rb") as file:
             if file.read(len(_START)) != _START:
                 problem = "is no ArduPilot log"
                 raise DataError(path, problem, "give the .bin that the autopilot wrote", code="wrong-kind")
         refuse_marks(path, _START[:2])
         refuse_marks(path, _START, most=_MOST_DEFINITIONS)
-    except OSError as error:
-        raise damaged(path, error) from error
     kind = need("pymavlink.DFReader", "drones").DFReader_binary
     reader = kind.__new__(kind)  # first without the file, which a failing __init__ leaves open
     try:

@@ -30,7 +30,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import as_data_error, empty, refuse_special, text_encoding
+from pipelines.session.storage import empty, on_disk, refuse_special, text_encoding
 
 _FIRST_YEAR, _LAST_YEAR = 1970, 2200  # of dates; others are damage
 # No flight lasts twelve days, so a larger time is damage.
@@ -241,7 +241,7 @@ def _read(path: Path) -> _Record:
     filming: list[bool] = []
     damaged = 0
     decimal_commas = heading.delimiter != ","  # until a latitude shows which mark is decimal
-    try:
+    with on_disk(path):
         for row in _rows(path, heading):
             try:
                 if (mark := _MARK.search(row[heading.numbers["latitude"][0]])) is not None:
@@ -259,8 +259,6 @@ def _read(path: Path) -> _Record:
                 values[name].append(number)
             clocks.append(clock)
             filming.append(films)
-    except OSError as error:
-        raise as_data_error(error, path) from error
     if not clocks:
         raise empty(path, f"holds no rows ({damaged} damaged)")
     blank = np.full(len(clocks), np.nan)

@@ -37,7 +37,7 @@ from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
-from pipelines.session.storage import damaged
+from pipelines.session.storage import damaged, on_disk
 
 _3D_FIX = 3
 _GPS = ("vehicle_gps_position", "sensor_gps")
@@ -320,21 +320,18 @@ def read_topics(path: Path, wanted: Collection[str], notes: list[str] | None = N
 def _refuse_bombs(path: Path) -> None:
     """Refuse definitions that expand without end: nested arrays may mean billions of fields."""
     formats: dict[str, list[tuple[str, str]]] = {}  # type and count of each field, by the name of the message
-    try:
-        with path.open("rb") as file:
-            if file.read(16)[: len(MAGIC)] != MAGIC:
-                wanted = "give the .ulg that the autopilot wrote"
-                raise DataError(path, "is no PX4 log", wanted, code="wrong-kind")
-            while len(head := file.read(3)) == 3:
-                size, kind = struct.unpack("<HB", head)
-                body = file.read(size)
-                if kind in b"ADL" or len(body) < size:
-                    break
-                if kind == ord("F"):
-                    name, _, fields = body.decode("utf-8", errors="replace").partition(":")
-                    formats[name] = re.findall(r"([^\s;\[]+)(?:\[(\d{1,9})\])?\s+[^;]+;?", fields)
-    except OSError as error:
-        raise damaged(path, error) from error
+    with on_disk(path), path.open("rb") as file:
+        if file.read(16)[: len(MAGIC)] != MAGIC:
+            wanted = "give the .ulg that the autopilot wrote"
+            raise DataError(path, "is no PX4 log", wanted, code="wrong-kind")
+        while len(head := file.read(3)) == 3:
+            size, kind = struct.unpack("<HB", head)
+            body = file.read(size)
+            if kind in b"ADL" or len(body) < size:
+                break
+            if kind == ord("F"):
+                name, _, fields = body.decode("utf-8", errors="replace").partition(":")
+                formats[name] = re.findall(r"([^\s;\[]+)(?:\[(\d{1,9})\])?\s+[^;]+;?", fields)
     sizes: dict[str, int] = {}
 
     def size_of(name: str, depth: int) -> int:

@@ -25,7 +25,7 @@ from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.recognition import describe_lfs_pointer
 from pipelines.session.records import Message, Topic
-from pipelines.session.storage import as_data_error, damaged, refuse_special
+from pipelines.session.storage import damaged, on_disk, refuse_special
 
 # Causes of losses, as sessions and `mocap info` state them.
 UNDEFINED = "messages without a usable definition"
@@ -500,13 +500,11 @@ def begins_like(path: Path, magic: bytes, suffixes: Collection[str]) -> bool:
 def open_file(path: Path) -> tuple[IO[bytes], int]:
     """Open a file; return it with its size."""
     refuse_special(path)
-    try:
+    with on_disk(path):
         size = path.stat().st_size
         if not size:
             raise damaged(path, "is empty (0 bytes)")
         file = path.open("rb")
-    except OSError as error:
-        raise as_data_error(error, path) from None
     if pointer := describe_lfs_pointer(file.read(1024)):
         file.close()
         raise DataError(path, *pointer, code="wrong-kind")

@@ -39,7 +39,7 @@ from pipelines.formats.logs.recordings import (
 from pipelines.formats.logs.trajectories import open_recording
 from pipelines.geometry.arrays import Int64
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, damaged
+from pipelines.session.storage import damaged, on_disk
 from pipelines.session.yaml_files import plain_yaml
 
 # Causes of losses.
@@ -140,12 +140,10 @@ def _merged(path: Path, folder: Path) -> Path:
     """Merge a database with its write-ahead log into a copy in another folder."""
     copy = folder / path.name
     log = _write_ahead_log(path)
-    try:
+    with on_disk(path):
         shutil.copyfile(path, copy)
         if log is not None:
             shutil.copyfile(log, copy.with_name(log.name))
-    except OSError as error:
-        raise as_data_error(error, path) from error
     with suppress(*_UNREADABLE):  # of a damaged log; what the database holds is read
         database = apsw.Connection(str(copy))
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()

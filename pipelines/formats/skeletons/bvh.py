@@ -124,12 +124,6 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
     Bones above the first moving one, each with a single child (a scene root), are merged into it. A bone
     further down with moving position channels is put at their mean, if it is never further than 5 cm from it.
     """
-    if unit not in METRES:
-        problem = f"the unit {unit!r} is none of {', '.join(METRES)}"
-        raise DataError(path, problem, "state one of them", code="unit-unknown")
-    if axes not in AXES:
-        problem = f"the axes {axes!r} are none of {', '.join(AXES)}"
-        raise DataError(path, problem, "state one of them", code="axes-unknown")
     bones, frame_time_s, values = _read(path)
     metres, order = METRES[unit], _IN_WORLD[axes]
     turned = [*order, 3]  # a rotation's axis is turned like any other vector

@@ -32,7 +32,7 @@ from pipelines.formats.skeletons.joint_files import (
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
-from pipelines.session.storage import as_data_error, damaged
+from pipelines.session.storage import damaged, on_disk
 
 # A C3D is divided into blocks of this many bytes.
 _BLOCK = 512
@@ -104,7 +104,7 @@ class _Contents:
 
 
 def _open(path: Path) -> _Contents:
-    try:
+    with on_disk(path):
         size = path.stat().st_size
         with path.open("rb") as file:
             head = file.read(_BLOCK)
@@ -113,8 +113,6 @@ def _open(path: Path) -> _Contents:
             # Some writers do not count the blocks. Then the section ends where the data begin.
             until_data = max(head[16 if section[3] != _MIPS else 17] - head[0], 0) if len(section) > 3 else 0
             section += file.read(max(*section[2:3], until_data, 1) * _BLOCK - _BLOCK)
-    except OSError as error:
-        raise as_data_error(error, path) from error
     if len(head) < _BLOCK or head[1] != _MAGIC or len(section) < 4:
         raise damaged(path, "is no readable C3D (it ends in its header)")
     processor = section[3]

@@ -331,11 +331,7 @@ class PictureTags(DroneLog):
 
 def _columns(path: Path) -> tuple[Int64, bool, dict[str, Float]]:
     """Return times and columns of all pictures, and True if some share a second (`picture_times`)."""
-    files = picture_files(path)
-    if not files:
-        problem = "is no folder of pictures"
-        raise DataError(path, problem, "name the folder that holds them", code="wrong-kind")
-    tags = [read_tags(file) for file in files]
+    tags = [read_tags(file) for file in FolderPictures(path).files]
     t_ns, shared = picture_times(tags)
     columns = {name: np.array([each.values.get(name, np.nan) for each in tags]) for name in NAMES}
     return t_ns, shared, columns | {"altitude": np.full(len(tags), np.nan)}

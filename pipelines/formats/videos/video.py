@@ -25,7 +25,7 @@ from pipelines.formats.common.rows import describe_times, since_epoch_ns
 from pipelines.geometry.arrays import Bool, Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import UNTIMED, VideoIndex
-from pipelines.session.storage import as_data_error, damaged, empty
+from pipelines.session.storage import damaged, empty, on_disk
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
@@ -310,10 +310,8 @@ class _CodedFrame(NamedTuple):
 
 def _scan(path: Path) -> _Scan:
     """Read the stamps of all packets that a decoder turns into pictures, in the order of showing."""
-    try:
+    with on_disk(path):
         about = path.stat()
-    except OSError as error:
-        raise as_data_error(error, path) from error
     return _scan_of(path, about.st_size, about.st_mtime_ns)
 
 
@@ -836,11 +834,9 @@ def _unreadable(path: Path, problem: str) -> DataError:
 
 def _kind(path: Path) -> str:
     """Return FFmpeg's name of the container, by its first bytes."""
-    try:
+    with on_disk(path):
         size = path.stat().st_size
         kind = container_format(path)
-    except OSError as error:
-        raise as_data_error(error, path) from error
     if not size:
         raise empty(path, "is empty")
     if kind is None:
