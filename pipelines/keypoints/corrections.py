@@ -181,18 +181,17 @@ def _with_visible_ends(t_s: Float, path: Bool, linked: Bool, crossing: Bool, cos
     kept = path.copy()
     edges = np.flatnonzero(np.diff(path, prepend=False, append=False))
     for first, stop in edges.reshape(-1, 2):
-        visible = [0 < end < len(path) and linked[end] and not crossing[end] for end in (first, stop)]
-        jumps = [_jumps(end, path, linked, crossing, cost) for end in (first, stop)]
+        ends = (first, stop)
+        visible = [0 < end < len(path) and linked[end] and not crossing[end] for end in ends]
+        jumps = [seen and _jumps(end, path, linked, cost) for end, seen in zip(ends, visible, strict=True)]
         short = t_s[stop - 1] - t_s[first] < _MAX_EXCHANGE_S
         if not (all(jumps) or (any(jumps) and jumps == visible and short)):
             kept[first:stop] = False
     return kept
 
 
-def _jumps(end: int, path: Bool, linked: Bool, crossing: Bool, cost: Float) -> bool:
-    """Test if the change before row `end` is a visible jump; False at the ends of the data."""
-    if not 0 < end < len(path) or not linked[end] or crossing[end]:
-        return False
+def _jumps(end: int, path: Bool, linked: Bool, cost: Float) -> bool:
+    """Test if the change before row `end`, where it is visible, is a jump."""
     before, now = int(path[end - 1]), int(path[end])
     changed, kept = cost[end, before, before, now], cost[end, before, before, before]
     if end + 1 < len(path) and linked[end + 1]:

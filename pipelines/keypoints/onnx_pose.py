@@ -420,14 +420,9 @@ class OnnxPose:
     ) -> None:
         self._network = network
         self._decoder = decoder
-        self._joints = joints
+        self.joints = joints
         self._people = people
         self._share = (1.0 if "head" in joints else _EYES) - (0.0 if "left_heel" in joints else _ANKLES)
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints."""
-        return self._joints
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
         """Find people in a picture [H, W, 3] BGR, best first; none without a person detector."""
@@ -446,7 +441,7 @@ class OnnxPose:
         crops = np.stack([sampled(picture, crop, size, beyond="black") for crop in placed])
         found = self._decoder.decode(self._network.batch(crops))
         for in_crop, score, crop, region in zip(*found, placed, regions, strict=True):
-            count = len(self._joints)
+            count = len(self.joints)
             xy = in_crop[:count] * np.diag(crop[:, :2]) + crop[:, 2]
             sure = score[:count] >= _MIN_JOINT_SCORE
             following = region
