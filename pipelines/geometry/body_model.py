@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Index
 from pipelines.geometry.compilation import cached
 from pipelines.geometry.poses import conjugate, matrix_from_quaternion, multiply, quaternion_from_matrix
-from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES
+from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES, unit
 
 # Order of the arrays in `data/body.npz` (`python tools/body_asset.py` made it, and describes them).
 SEXES = ("female", "male")
@@ -382,15 +382,15 @@ def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:
         axis = np.array([0.0, -np.cos(lean_rad), -sign * np.sin(lean_rad)])
         upper, lower = along("upper_arm", "forearm"), along("forearm", "hand")
         rest_axis = np.cross(upper, lower)
-        turns[bone("upper_arm")] = _turn((upper, rest_axis), (down, axis))
-        turns[bone("forearm")] = turns[bone("hand")] = _turn((lower, rest_axis), (down, axis))
+        turns[bone("upper_arm")] = turned((upper, rest_axis), (down, axis))
+        turns[bone("forearm")] = turns[bone("hand")] = turned((lower, rest_axis), (down, axis))
 
         left, straight = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
-        turns[bone("thigh")] = _turn((along("thigh", "shank"), left), (straight, left))
-        turns[bone("shank")] = _turn((along("shank", "foot"), left), (straight, left))
+        turns[bone("thigh")] = turned((along("thigh", "shank"), left), (straight, left))
+        turns[bone("shank")] = turned((along("shank", "foot"), left), (straight, left))
         ahead = along("foot", "toes") * [1.0, 1.0, 0.0]
         up = np.array([0.0, 0.0, 1.0])
-        turns[bone("foot")] = turns[bone("toes")] = _turn((ahead, up), (np.array([1.0, 0.0, 0.0]), up))
+        turns[bone("foot")] = turns[bone("toes")] = turned((ahead, up), (np.array([1.0, 0.0, 0.0]), up))
     return quaternion_from_matrix(turns)
 
 
@@ -409,15 +409,14 @@ def neutral_offsets(rest_joint: Float, turns: Float) -> Float:
     return offset
 
 
-def _turn(source: tuple[Float, Float], target: tuple[Float, Float]) -> Float:
-    """Return the rotation that takes the first source direction to the first target direction."""
-    turn: Float = np.einsum("ik,jk->ij", _frame(*target), _frame(*source))
+def turned(source: tuple[Float, Float], target: tuple[Float, Float]) -> Float:
+    """Return rotations [..., 3, 3] that take the first source directions [..., 3] to the first targets."""
+    turn: Float = np.einsum("...ik,...jk->...ij", _frame(*target), _frame(*source))
     return turn
 
 
 def _frame(first: Float, second: Float) -> Float:
     """Return axes in columns: along the first, across both, and the third."""
-    x = first / np.linalg.norm(first)
-    z = np.cross(x, second)
-    z /= np.linalg.norm(z)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    x = unit(first)
+    z = unit(np.cross(x, second))
+    return np.stack([x, np.cross(z, x), z], axis=-1)

@@ -145,8 +145,9 @@ def from_axes(forward: Float, left: Float, up: Float) -> Float:
 
 
 def unit(vectors: Float) -> Float:
-    """Scale vectors [T, 3] to length 1."""
-    return np.asarray(vectors / np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)), dtype=np.float64)
+    """Scale vectors [..., 3] to length 1; NaN for zero."""
+    length = np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True))
+    return np.asarray(vectors / np.where(length > 1e-9, length, np.nan), dtype=np.float64)
 
 
 def between(one: Float, other: Float) -> Float:

@@ -60,18 +60,20 @@ def fit_bodies(observations: Observations, views: Views, result: Triangulation) 
 
 def _errors(
     landmarks: Landmarks, views: Views, result: Triangulation, first_row: Index, columns: Index, times: Index
-) -> tuple[Float, Float]:
-    """Divide the covariances of landmarks into their own and a common one, see `body_fit.fit_body`.
+) -> tuple[Float, Float, Float]:
+    """Divide the covariances of landmarks into their own and common ones, see `body_fit.fit_body`.
 
     A joint's covariance holds errors of the camera poses, which move all joints of a person together. Its own
     error is the detector's, which errs by so much of a body in every picture: with unit vectors d along the
     inliers' rays, the inverse of the sum of I - d d^T times a variance, or the whole where that is smaller.
-    The mean of what is left is common.
+    The mean of what is left is common. A person who is nearer than thought looks larger: such an error along
+    a ray, relative to the distance, is the scale's.
     """
     start = first_row[times]
     rows = start[:, None] + columns
     away = np.nanmean(result.points[rows], axis=1)[:, None] - views.position[views.pose_index[start]]
-    ray = away / np.linalg.norm(away, axis=-1, keepdims=True)
+    distance = np.linalg.norm(away, axis=-1, keepdims=True)
+    ray = away / distance
     across = np.nan_to_num(np.eye(3) - ray[..., None] * ray[..., None, :])  # [N, C, 3, 3]
     normal = np.einsum("nkc,ncij->nkij", result.inlier[rows].astype(np.float64), across)
     sure = np.linalg.det(normal) > _MIN_DETERMINANT
@@ -87,7 +89,9 @@ def _errors(
     mean = total / np.maximum(finite.sum(axis=1), 1)[:, None, None]
     size, axes = np.linalg.eigh((mean + np.swapaxes(mean, -1, -2)) / 2)
     found: Float = (axes * np.maximum(size, 0.0)[:, None]) @ np.swapaxes(axes, -1, -2)
-    return np.where(unknown, _UNKNOWN_M2 * np.eye(3), own), found
+    nearer = np.nan_to_num(ray / distance)
+    scale = np.einsum("nci,nij,ncj->nc", nearer, found, nearer).mean(axis=1)
+    return np.where(unknown, _UNKNOWN_M2 * np.eye(3), own), found, scale
 
 
 # --- one camera ----------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 from pipelines.geometry.arrays import Float, Index, Int64
-from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE_SIGMA, BodyModel, body_model
+from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE_SIGMA, BodyModel, body_model, turned
 from pipelines.geometry.poses import (
     cross_matrix,
     matrix_from_quaternion,
@@ -31,7 +31,8 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES
+from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES, unit
+from pipelines.session.people import mirrored
 
 _TABLE = Path(__file__).parent / "data" / "landmarks.csv"
 
@@ -44,6 +45,9 @@ MIN_LANDMARKS = 10
 _INDEPENDENT_S = 2.0
 # Correlation of the offsets of a face's, a hand's or a foot's landmarks on the tuning flights.
 _ALIKE_IN_A_GROUP = 0.85
+# Correlation of left and right offsets along a limb there: 0.2 to 0.9. Taken for independent, they would
+# average, and make statures seem surer.
+_ALIKE_ON_BOTH_SIDES = 0.6
 # More moments hardly make the shape surer, because offsets of landmarks stay.
 _MOST_MOMENTS = 200
 # Poses of so many moments at once take 50 MB.
@@ -244,13 +248,13 @@ class Normal:
 
 
 def fit_body(
-    landmarks: Landmarks, t_ns: Int64, place: Float, errors: Callable[[Index], tuple[Float, Float]]
+    landmarks: Landmarks, t_ns: Int64, place: Float, errors: Callable[[Index], tuple[Float, Float, Float]]
 ) -> BodyFit | None:
     """Fit the body to one person's K landmarks, `place` [T, K, 3] m, NaN where missing; None without one.
 
     `errors` gives for N of the times the covariances m^2 of each landmark's own error [N, K, 3, 3], and of
-    the error that all landmarks of a time share [N, 3, 3]. The body has all times with both hips, both
-    shoulders and ten landmarks.
+    the error that all landmarks of a time share [N, 3, 3], and the variance of the scale [N], which is taken
+    for constant. The body has all times with both hips, both shoulders and ten landmarks.
     """
     known = np.asarray(np.isfinite(place).all(axis=-1))
     trunk = [landmarks.joints.index(name) for name in _TRUNK]
@@ -265,11 +269,12 @@ def fit_body(
     points = Points(model, landmarks)
     chosen = row[_apart(t_ns[row])]
     first = _first_poses(model, landmarks, place[chosen])
-    shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], errors(chosen)[0]))
+    own, _, scale = errors(chosen)
+    shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], own), float(np.median(scale)))
     parts = []
     for start in range(0, len(row), _BLOCK):
         rows = row[start : start + _BLOCK]
-        own, common = errors(rows)
+        own, common, _ = errors(rows)
         first, seen = _first_poses(model, landmarks, place[rows]), _seen(place[rows], own)
         turn, turn_covariance, centre, centre_covariance = _fit_poses(
             points, first, seen, shared, shared_covariance
@@ -349,13 +354,15 @@ class Points:
         """Compute the cost [N] of each moment's landmarks."""
         return self._whitened(poses, seen, shared)[3]
 
-    def normal(self, poses: Poses, seen: Places | Rays, shared: Shared, *, whole: bool) -> Normal:
-        """Build the normal equations; those of shared unknowns only if `whole`."""
+    def normal(
+        self, poses: Poses, seen: Places | Rays, shared: Shared, *, whole: bool, share: float = 1.0
+    ) -> Normal:
+        """Build the normal equations, with a `share` of the usual posture; of shared unknowns if `whole`."""
         stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
         arms, root, errors, cost, slope = self._whitened(poses, seen, shared)
         transposed, white = np.swapaxes(slope, 1, 2), errors.reshape(count, -1)
         pose, right = transposed @ slope, (transposed @ white[..., None])[..., 0]
-        cost = cost + _add_ranges(poses.turn, pose, right)
+        cost = cost + _add_ranges(poses.turn, pose, right, share)
         if not whole:
             empty = np.zeros((0, 0))
             return Normal(cost, pose, right, empty, empty, empty)
@@ -430,12 +437,17 @@ def _spread(slope: Float, by_shared: Float, covariance: Float, shared_covariance
 
 def shared_prior(landmarks: Landmarks) -> SharedPrior:
     """Return the prior of shape, offsets and level."""
-    sigma, same = landmarks.body_sigma, landmarks.bone[:, None] == landmarks.bone
-    share = np.where(same & (same.sum(axis=1) > 2), _ALIKE_IN_A_GROUP, 0.0)
+    sigma, names = landmarks.body_sigma, landmarks.joints
+    group = landmarks.bone[:, None] == landmarks.bone
+    group &= group.sum(axis=1) > 2
+    share = np.where(group, _ALIKE_IN_A_GROUP, 0.0)
     np.fill_diagonal(share, 1.0)
     precision = np.eye(13 + 3 * len(sigma))
     precision[:12, :12] = np.diag(SHAPE_SIGMA**-2)
-    precision[12:-1, 12:-1] = np.kron(np.linalg.inv(share * np.outer(sigma, sigma)), np.eye(3))
+    mirror = np.array([[mirrored(one) == other != one for other in names] for one in names])
+    along = share + _ALIKE_ON_BOTH_SIDES * np.where(group, 0.0, share @ mirror)
+    for axis, own in enumerate((share, share, along)):
+        precision[12 + axis : -1 : 3, 12 + axis : -1 : 3] = np.linalg.inv(own * np.outer(sigma, sigma))
     return SharedPrior(np.concatenate([MEAN_SHAPE, np.zeros(3 * len(sigma) + 1)]), precision)
 
 
@@ -472,7 +484,7 @@ def joint_ranges() -> JointRanges:
     return JointRanges(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def _add_ranges(turn: Float, pose: Float, right: Float) -> Float:
+def _add_ranges(turn: Float, pose: Float, right: Float, share: float) -> Float:
     """Add the ranges of joints to normal equations, in place; return their cost [N]."""
     usual = joint_ranges()
     bones, parents, low, high = usual.bone, usual.parent, usual.low, usual.high
@@ -484,8 +496,9 @@ def _add_ranges(turn: Float, pose: Float, right: Float) -> Float:
     steep = np.where(beyond == 0.0, 0.0, _BOUND_RAD**-2)
     away = vector - usual.usual
     square = np.sum((away / usual.sigma) ** 2, axis=-1, keepdims=True) / _USUAL_CAUCHY**2
-    weight = usual.sigma**-2 / (1 + square)
-    cost = _USUAL_CAUCHY**2 * np.log1p(square).sum(axis=(1, 2)) + np.sum(steep * beyond**2, axis=(1, 2))
+    weight = share * usual.sigma**-2 / (1 + square)
+    bound = np.sum(steep * beyond**2, axis=(1, 2))
+    cost = share * _USUAL_CAUCHY**2 * np.log1p(square).sum(axis=(1, 2)) + bound
 
     slope = _inverse_left_jacobian(vector) @ np.swapaxes(frame, -1, -2)
     weighted = np.swapaxes(slope, -1, -2) * (weight + steep)[..., None, :]
@@ -514,8 +527,15 @@ def _inverse_left_jacobian(vector: Float) -> Float:
 # --- solving -------------------------------------------------------------------------------------------
 
 
-def _fit_shared(points: Points, poses: Poses, seen: Places | Rays) -> tuple[Shared, Float]:
-    """Fit shape and offsets with the poses of some moments; return them and their covariance [G, G]."""
+def _fit_shared(points: Points, poses: Poses, seen: Places, scale: float) -> tuple[Shared, Float]:
+    """Fit shape and offsets with the poses of some moments; return them and their covariance [G, G].
+
+    An unknown scale of variance `scale` enlarges all places. What is fitted is its product with the stature.
+    """
+    mean, precision = points.prior.mean, points.prior.precision.copy()
+    of_scale, of_stature = mean[0] ** 2 * scale, 1 / precision[0, 0]
+    precision[0, 0] = 1 / (of_stature + of_scale)
+    points.prior = SharedPrior(mean, precision)
     shared = Shared(MEAN_SHAPE.copy(), np.zeros((len(points.bone), 3)))
     normal = points.normal(poses, seen, shared, whole=True)
     cost, damping = normal.cost.sum() + points.prior.cost(shared), 1e-3
@@ -534,7 +554,13 @@ def _fit_shared(points: Points, poses: Poses, seen: Places | Rays) -> tuple[Shar
         if done:
             break
     _, _, reduced, _ = _reduced(normal, 0.0)
-    return shared, np.asarray(np.linalg.inv(reduced), np.float64)
+    covariance = np.asarray(np.linalg.inv(reduced), np.float64)
+    share = of_stature * precision[0, 0]  # of the product's deviation that is the stature's
+    shared.shape[0] = mean[0] + share * (shared.shape[0] - mean[0])
+    covariance[0] *= share
+    covariance[:, 0] *= share
+    covariance[0, 0] += share * of_scale
+    return shared, covariance
 
 
 def _reduced(normal: Normal, damping: float) -> tuple[Float, Float, Float, Float]:
@@ -615,12 +641,12 @@ def _first_poses(model: BodyModel, landmarks: Landmarks, place: Float) -> Poses:
 
     up = at("left_shoulder") + at("right_shoulder") - at("left_hip") - at("right_hip")
     z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
-    pelvis = _turned((y, z), (at("left_hip") - at("right_hip"), up))
-    chest = _turned((z, y), (up, at("left_shoulder") - at("right_shoulder")))
+    pelvis = turned((y, z), (at("left_hip") - at("right_hip"), up))
+    chest = turned((z, y), (up, at("left_shoulder") - at("right_shoulder")))
     turn = np.repeat(chest[:, None], len(BONES), axis=1)
     turn[:, [BONE["pelvis"], BONE["spine"]]] = pelvis[:, None]
     ears = (at("left_ear") + at("right_ear")) / 2
-    head = _turned((y, np.array([1.0, 0.0, 0.0])), (at("left_ear") - at("right_ear"), at("nose") - ears))
+    head = turned((y, np.array([1.0, 0.0, 0.0])), (at("left_ear") - at("right_ear"), at("nose") - ears))
     _put(turn, ("head", "neck"), head, chest)
     steps = model.steps[0]
     for side in SIDES:
@@ -629,17 +655,17 @@ def _first_poses(model: BodyModel, landmarks: Landmarks, place: Float) -> Poses:
             (1.0, pelvis, ("thigh", "shank", "foot"), ("hip", "knee", "ankle")),
         ):
             start, middle, end = (at(f"{side}_{name}") for name in joints)
-            one, two = _unit(middle - start), _unit(end - middle)
+            one, two = unit(middle - start), unit(end - middle)
             # Next to straight a hinge shows no axis: then it is the parent's.
             axis = sign * np.cross(one, two) + 0.1 * parent[..., 1]
             upper_bone, lower_bone, last = (f"{side}_{name}" for name in bones)
-            upper = _turned((steps[BONE[lower_bone]], y), (one, axis))
-            lower = _turned((steps[BONE[last]], y), (two, axis))
+            upper = turned((steps[BONE[lower_bone]], y), (one, axis))
+            lower = turned((steps[BONE[last]], y), (two, axis))
             _put(turn, (upper_bone,), upper, parent)
             _put(turn, (lower_bone, last), lower, turn[:, BONE[upper_bone]])
         forward = at(f"{side}_big_toe") - at(f"{side}_heel")
         shank = turn[:, BONE[f"{side}_shank"]]
-        foot = _turned((np.array([1.0, 0.0, 0.0]), y), (forward, shank[..., 1]))
+        foot = turned((np.array([1.0, 0.0, 0.0]), y), (forward, shank[..., 1]))
         _put(turn, (f"{side}_foot", f"{side}_toes"), foot, shank)
     hips = (steps[BONE["left_thigh"]] + steps[BONE["right_thigh"]]) / 2
     root = (at("left_hip") + at("right_hip")) / 2 - MEAN_SHAPE[0] * pelvis @ hips
@@ -650,22 +676,3 @@ def _put(turn: Float, bones: tuple[str, ...], found: Float, otherwise: Float) ->
     """Set the rotations of some bones where they are known, elsewhere to others."""
     known = np.asarray(np.isfinite(found).all(axis=(1, 2)))
     turn[:, [BONE[name] for name in bones]] = np.where(known[:, None, None], found, otherwise)[:, None]
-
-
-def _turned(neutral: tuple[Float, Float], seen: tuple[Float, Float]) -> Float:
-    """Return the rotations [N, 3, 3] from two neutral directions [3] to [N, 3]; the first exactly."""
-    start = _axes(neutral[0][None], neutral[1][None])[0]
-    found: Float = _axes(*seen) @ start.T
-    return found
-
-
-def _axes(first: Float, second: Float) -> Float:
-    x = _unit(first)
-    z = _unit(np.cross(x, second))
-    return np.stack([x, np.cross(z, x), z], axis=-1)
-
-
-def _unit(vector: Float) -> Float:
-    """Scale vectors [..., 3] to length 1; NaN for zero."""
-    length = np.linalg.norm(vector, axis=-1, keepdims=True)
-    return vector / np.where(length > 1e-9, length, np.nan)

@@ -307,15 +307,17 @@ class StandingPoints(Points):
         precision[0, 0], precision[-1, -1] = stature_m[1] ** -2, ground.sigma_m**-2
         self.prior = SharedPrior(mean, precision)
 
-    def normal(self, poses: Poses, seen: Places | Rays, shared: Shared, *, whole: bool) -> Normal:
+    def normal(
+        self, poses: Poses, seen: Places | Rays, shared: Shared, *, whole: bool, share: float = 1.0
+    ) -> Normal:
         """Add what holds the pelvis upright and the lowest point on the ground."""
-        found = super().normal(poses, seen, shared, whole=whole)
+        found = super().normal(poses, seen, shared, whole=whole, share=share)
         away, lying = _lying(poses.turn)
         slope = -cross_matrix(poses.turn[:, 0, :, 2]) / _UPRIGHT_RAD
-        transposed = np.swapaxes(slope, 1, 2) / np.exp(lying)[:, None, None]
+        transposed = share * np.swapaxes(slope, 1, 2) / np.exp(lying)[:, None, None]
         found.pose[:, 3:6, 3:6] += transposed @ slope
         found.pose_right[:, 3:6] -= (transposed @ away[..., None])[..., 0]
-        cost = found.cost + lying
+        cost = found.cost + share * lying
 
         stature, count = shared.shape[0], len(poses.root)
         vectors = np.tensordot(np.array([1.0, *shared.shape[1:]]), self.contacts, 1)
@@ -327,7 +329,7 @@ class StandingPoints(Points):
         sigma_m = _CONTACT_SIGMA_M * stature / MEAN_SHAPE[0]
         error = np.where(touching, height / sigma_m, 0.0)
         square = (error / _CONTACT_CAUCHY) ** 2
-        bounded = touching / np.sqrt(1 + square) / sigma_m
+        bounded = np.sqrt(share) * touching / np.sqrt(1 + square) / sigma_m
         error *= bounded * sigma_m
         by_pose = np.zeros((*height.shape, found.pose.shape[1]))
         by_pose[..., 2] = 1.0
@@ -431,6 +433,8 @@ def _fit(points: StandingPoints, t_ns: Int64, rays: Rays, poses: Poses, shared: 
         cost, damping = new_cost, damping / 5
         if done:
             break
+    # Postures last: what is usual is evidence in each moment for the estimate, but not for its covariance.
+    normal = points.normal(poses, rays, shared, whole=True, share=_ALIKE**-2)
     chain = _Chain(normal, motion, 0.0)
     border = normal.shared - np.einsum("ndg,ndh->gh", normal.between, chain.answer, optimize=True)
     covariance = np.asarray(np.linalg.inv(border), np.float64)

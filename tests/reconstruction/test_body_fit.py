@@ -60,9 +60,9 @@ def moving(rng: np.random.Generator) -> tuple[Poses, Float]:
     return Poses(root, turn), MEAN_SHAPE + SHAPE_SIGMA * rng.normal(size=len(MEAN_SHAPE))
 
 
-def errors_of(own: Float, rows: Index) -> tuple[Float, Float]:
-    """Return the covariances of some moments, and no common error."""
-    return own[rows], np.zeros((len(rows), 3, 3))
+def errors_of(own: Float, rows: Index, scale: float = 0.0) -> tuple[Float, Float, Float]:
+    """Return the covariances of some moments, no common error, and the variance of the scale."""
+    return own[rows], np.zeros((len(rows), 3, 3)), np.full(len(rows), scale)
 
 
 def places(points: Points, poses: Poses, shared: Shared) -> Float:
@@ -154,7 +154,7 @@ def test_another_skeleton_and_a_person_without_a_trunk_have_no_body() -> None:
     assert landmarks_of(("left_hip", "right_hip", "tail")) is None
     landmarks = known_landmarks()
     place = np.full((2, len(landmarks.bone), 3), np.nan)
-    assert fit_body(landmarks, np.arange(2), place, lambda _: (place, place)) is None
+    assert fit_body(landmarks, np.arange(2), place, lambda _: (place, place, place)) is None
 
 
 def test_depths_that_parallel_rays_leave_open_have_no_weight() -> None:
@@ -169,6 +169,15 @@ def test_depths_that_parallel_rays_leave_open_have_no_weight() -> None:
     assert body is not None
     assert np.isfinite(body.centre_covariance).all()
     assert abs(body.shape[0] - shape[0]) < 4 * np.sqrt(body.shape_covariance[0, 0])
+    # A scale that is known to 10 % leaves the stature to its prior.
+    by_scale = partial(errors_of, own, scale=0.1**2)
+    unscaled = fit_body(landmarks, np.arange(TIMES) * 400_000_000, place, by_scale)
+    assert unscaled is not None
+    sigma_m = 1 / np.hypot(1 / SHAPE_SIGMA[0], 1 / (0.1 * MEAN_SHAPE[0]))
+    share = (SHAPE_SIGMA[0] - sigma_m) * (SHAPE_SIGMA[0] + sigma_m) / SHAPE_SIGMA[0] ** 2
+    away = unscaled.shape[0] - MEAN_SHAPE[0], body.shape[0] - MEAN_SHAPE[0]
+    assert away[0] == pytest.approx(share * away[1], abs=5e-3)
+    assert np.sqrt(unscaled.shape_covariance[0, 0]) == pytest.approx(sigma_m, rel=0.05)
 
 
 @pytest.mark.parametrize(("level_sigma_m", "most_mm"), [(0.05, 350.0), (UNKNOWN_LEVEL_SIGMA_M, 700.0)])

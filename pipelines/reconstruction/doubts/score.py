@@ -377,7 +377,9 @@ def score(
     gain = 0.0 if reference is None else SCATTER_WEIGHT * np.log(max(reference / SCATTER_RANGE[0], 1.0))
     if total - gain > limit:
         return Score(total, misfit, np.inf, {"behind": behind}, np.nan)
-    scatter = _scatter(scene, solved)
+    pairs = combinations(range(len(scene.focal_px)), 2)
+    found = [value for pair in pairs if (value := _scatter(scene, solved, pair)) is not None]
+    scatter = float(np.mean(found)) if found else 9.0
     if base is not None and reference is not None:
         floor, top = SCATTER_RANGE
         # In the same pixels, keypoints scatter as much; a wrong focal length bends what little they do.
@@ -447,15 +449,8 @@ def _rays(solved: SolvedJoints, good: Bool, misfit: float) -> dict[str, Oddity]:
     }
 
 
-def _scatter(scene: SceneOfMoments, solved: SolvedJoints) -> float:
-    """Return the scatter of two cameras' rays within pictures over their noise, mean over the pairs."""
-    found = [_scatter_of_pair(scene, solved, pair) for pair in combinations(range(len(scene.focal_px)), 2)]
-    known = [value for value in found if value is not None]
-    return float(np.mean(known)) if known else 9.0
-
-
-def _scatter_of_pair(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
-    """Fit constant errors of both poses to the rays' distances, and measure what they leave."""
+def _scatter(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
+    """Fit constant errors of two poses to the rays' distances, and measure what they leave over the noise."""
     shape = solved.seen.shape[1:]
     used, design, apart, noise2 = _crossings(scene, solved, pair)
     if len(used) < _FEWEST:

@@ -18,7 +18,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction.background_tracks import Followed, Tracks
+from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 
@@ -88,7 +88,9 @@ def turns_of(camera: Camera, followed: Followed) -> Turns:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         begins = np.searchsorted(tracks.picture, np.arange(len(t_ns) + 1))
         for k in range(int(tracks.picture[0]), int(tracks.picture[-1]) - span + 1, span):
-            one, other = _common(tracks, begins, k, k + span)
+            one, other = (np.arange(begins[each], begins[each + 1]) for each in (k, k + span))
+            shared = np.intersect1d(tracks.point[one], tracks.point[other], return_indices=True)
+            one, other = one[shared[1]], other[shared[2]]
             if len(one) >= _FEWEST_POINTS and len(first) < _MOST_TURNS * (place + 1) / len(chosen):
                 some = np.linspace(0, len(one) - 1, _POINTS).astype(np.intp)
                 pairs.append((rays[one[some]], rays[other[some]]))
@@ -96,14 +98,6 @@ def turns_of(camera: Camera, followed: Followed) -> Turns:
     second = np.array(first, dtype=np.intp) + span
     before, after = np.array(pairs).reshape(-1, 2, _POINTS, 3).swapaxes(0, 1)
     return Turns(t_ns[second - span], t_ns[second], before, after)
-
-
-def _common(tracks: Tracks, begins: Int64, first: int, second: int) -> tuple[Int64, Int64]:
-    """Find the sightings of the points that two pictures share."""
-    one = np.arange(begins[first], begins[first + 1])
-    other = np.arange(begins[second], begins[second + 1])
-    _, in_one, in_other = np.intersect1d(tracks.point[one], tracks.point[other], return_indices=True)
-    return one[in_one], other[in_other]
 
 
 def _turned(before: Float, after: Float, logged: Float, moved: Float) -> Float:
@@ -212,7 +206,9 @@ def _gains(
         if both.sum() < _FEWEST_TURNS:
             found.append((0.0, np.inf, 0.0))
             continue
-        squares = [_mean_square(each[both]) for each in (stated, left, logged)]
+        angles = np.stack([each[both] for each in (stated, left, logged)])
+        usual = np.minimum(angles, np.quantile(angles, _USUAL_SHARE, axis=1, keepdims=True))
+        squares = (np.mean(usual**2, axis=1) + 1e-12).tolist()
         found.append((float(both.sum() * np.log(squares[0] / squares[1])), squares[1], squares[2]))
     return found
 
@@ -232,12 +228,6 @@ def _left(
     left[known] = np.linalg.norm(found, axis=1)
     turned[known] = np.linalg.norm(_vectors(logged[known]), axis=1)
     return left, turned
-
-
-def _mean_square(angles: Float) -> float:
-    """Return the mean square of angles, without the largest."""
-    most = np.quantile(angles, _USUAL_SHARE)
-    return float(np.mean(np.minimum(angles, most) ** 2)) + 1e-12
 
 
 def _summed(found: Sequence[tuple[float, float, float]]) -> tuple[float, bool]:
