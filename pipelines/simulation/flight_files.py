@@ -6,12 +6,15 @@ left out. Axes are the world's, east-north-up.
 """
 
 import json
+import sys
 from collections.abc import Iterable, Iterator, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from ruamel.yaml import YAML
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.body_model import SHAPE, body_model, shape_of
@@ -56,15 +59,14 @@ def write_joints(
     path: Path, t_ns: Int64, names: tuple[str, ...], people: Sequence[Float], *, numbered: bool
 ) -> None:
     """Write joints [T, J, 3] of each person as a long CSV: t_ns, person if numbered, joint, x, y, z in m."""
-    lines = [f"t_ns,{'person,' if numbered else ''}joint,x,y,z"]
-    for row, stamp in enumerate(t_ns.tolist()):
-        for person, joints in enumerate(people):
-            begin = f"{stamp},{person}," if numbered else f"{stamp},"
-            lines += [
-                f"{begin}{name},{x:.6f},{y:.6f},{z:.6f}"
-                for name, (x, y, z) in zip(names, joints[row].tolist(), strict=True)
-            ]
-    write_lines(path, lines)
+    rows = pd.MultiIndex.from_product([t_ns, range(len(people)), names], names=["t_ns", "person", "joint"])
+    _write_csv(path, pd.DataFrame(np.stack(people, axis=1).reshape(-1, 3), rows, [*"xyz"]), numbered=numbered)
+
+
+def _write_csv(path: Path, table: pd.DataFrame, *, numbered: bool) -> None:
+    """Write a table with its index, of which `person` is left out unless people are numbered."""
+    table = table if numbered else table.droplevel("person")
+    table.to_csv(path, float_format="%.6f", lineterminator="\n")
 
 
 def write_alphapose(path: Path, people: Iterable[TrackedKeypoints]) -> None:
@@ -120,7 +122,7 @@ def write_truth(folder: Path, flight: SimulatedFlight) -> None:
             poses.camera_position,
             poses.camera_quaternion_xyzw,
         )
-        write_lines(truth / f"{drone.name}_visible.csv", _visible_lines(flight, drone))
+        _write_csv(truth / f"{drone.name}_visible.csv", _visible_table(flight, drone), numbered=numbered)
     offsets = {drone.name: drone.clock_offset_s for drone in flight.drones}
     write_json(truth / "clocks.json", {"clock_offsets_s": offsets})
 
@@ -150,15 +152,12 @@ def true_shapes(flight: SimulatedFlight) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["person", "number", "value", "sigma"])
 
 
-def _visible_lines(flight: SimulatedFlight, drone: SimulatedDrone) -> list[str]:
-    """Lines of CSV: frame, person where the scenario has `actors`, and 1 or 0 for each joint."""
-    visible = [visible_joints(flight, drone, person)[1].astype(int).astype(str) for person in flight.people]
-    numbered = flight.scenario.actors is not None
-    lines = [",".join(["frame", *(["person"] if numbered else []), *flight.people[0].person.joints])]
-    for frame in range(len(drone.at_frames.t_ns)):
-        for number, rows in enumerate(visible):
-            lines.append(",".join([str(frame), *([str(number)] if numbered else []), *rows[frame]]))
-    return lines
+def _visible_table(flight: SimulatedFlight, drone: SimulatedDrone) -> pd.DataFrame:
+    """Make a row of each frame and person, with 1 or 0 for each joint."""
+    visible = np.stack([visible_joints(flight, drone, each)[1] for each in flight.people], axis=1)
+    rows = pd.MultiIndex.from_product([*map(range, visible.shape[:2])], names=["frame", "person"])
+    joints = [*flight.people[0].person.joints]
+    return pd.DataFrame(visible.reshape(-1, len(joints)).astype(int), rows, joints)
 
 
 def write_keypoints(folder: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
@@ -179,45 +178,34 @@ _UNKNOWN_CLOCK_SIGMA_S = 0.3
 
 def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = False) -> str:
     """Write the manifest, which states what a user would know, with `true_poses` the true ones as logged."""
-    scenario = flight.scenario
-    lines = [
-        "# Simulated by `mocap simulate` from scenario.yaml; simulation.json says how.",
-        *([] if video else [f"# The keypoints have the measured errors of {scenario.keypoints.detector}."]),
-        *_shot(flight),
-        "schema: 1",
-        f"name: {_quoted(scenario.name)}",
-        "simulated: true",
-        "world: {frame: enu}",
-        "logs:",
-        *(f"  {drone.name}: {{file: {drone.name}.mcap}}" for drone in flight.drones),
-        "cameras:",
-    ]
-    for drone in flight.drones:
-        lines += [*_pictures(flight, drone, video), *_poses(flight, drone, true_poses)]
-    poses = ", ".join(f"{drone.name}: truth/{drone.name}.tum" for drone in flight.drones)
-    lines += [
-        *_logged_people(flight),
-        "map: site.npz",
-        "truth:",
-        "  file: truth/joints.csv",
-        f"  poses: {{{poses}}}",
-        "  body: truth/body.parquet",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _logged_people(flight: SimulatedFlight) -> list[str]:
-    """Write who was logged: by name where the scenario has `actors`."""
-    if flight.scenario.actors is None:
-        return [f"actor: {{file: drone1, topic: {flight.people[0].topic}, point: hip}}"]
-    return [
-        "actors:",
-        *(
-            f"  {person.name}: {{file: drone1, topic: {person.topic}, point: hip}}"
-            for person in flight.people
-        ),
-    ]
+    scenario, drones = flight.scenario, flight.drones
+    notes = ["Simulated by `mocap simulate` from scenario.yaml; simulation.json says how."]
+    if not video:
+        notes.append(f"The keypoints have the measured errors of {scenario.keypoints.detector}.")
+    notes += _shot(flight)
+    people = {each.name: {"file": "drone1", "topic": each.topic, "point": "hip"} for each in flight.people}
+    manifest = {
+        "schema": 1,
+        "name": scenario.name,
+        "simulated": True,
+        "world": {"frame": "enu"},
+        "logs": {drone.name: {"file": f"{drone.name}.mcap"} for drone in drones},
+        "cameras": {
+            drone.name: _pictures(flight, drone, video) | _poses(flight, drone, true_poses)
+            for drone in drones
+        },
+        **({"actors": people} if scenario.actors is not None else {"actor": next(iter(people.values()))}),
+        "map": "site.npz",
+        "truth": {
+            "file": "truth/joints.csv",
+            "poses": {drone.name: f"truth/{drone.name}.tum" for drone in drones},
+            "body": "truth/body.parquet",
+        },
+    }
+    yaml, text = YAML(), StringIO()
+    yaml.default_flow_style, yaml.width = None, sys.maxsize  # the innermost mappings stand on one line
+    yaml.dump(manifest, text)
+    return "".join(f"# {note}\n" for note in notes) + text.getvalue()
 
 
 def _shot(flight: SimulatedFlight) -> list[str]:
@@ -231,55 +219,37 @@ def _shot(flight: SimulatedFlight) -> list[str]:
     if not any(parts):
         return []
     stamps = "a picture's time is the middle of the exposure of its middle row"
-    return [f"# Pictures: {', '.join(part for part in parts if part)}; {stamps}."]
+    return [f"Pictures: {', '.join(part for part in parts if part)}; {stamps}."]
 
 
-def _quoted(text: str) -> str:
-    """Return any text as a scalar of YAML on one line."""
-    plain = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in plain) + '"'
-
-
-def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> list[str]:
-    name = drone.name
-    known = not any(other.clock_offset_s for other in flight.drones)
-    start_ns = int(picture_stamps(flight, drone)[0])
-    whole, fraction = divmod(start_ns, 10**9)
+def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> dict[str, object]:
+    name, readout_s = drone.name, drone.intrinsics.readout_s
     if video:
-        pictures = [f"    video: {name}.mp4", f"    frame_times: {{start: {whole}.{fraction:09d}}}"]
+        start_s = int(picture_stamps(flight, drone)[0]) / 10**9
+        pictures: dict[str, object] = {"video": f"{name}.mp4", "frame_times": {"start": start_s}}
     else:
-        pictures = [
-            f"    frame_times: {{file: {name}_frames.csv}}",
-            f"    keypoints: {{file: {name}_keypoints.json, format: alphapose, skeleton: coco17}}",
-        ]
-    sigma_s = 0 if known else _UNKNOWN_CLOCK_SIGMA_S
-    intrinsics, readout_s = f"{name}_camera.yaml", drone.intrinsics.readout_s
-    if readout_s:
-        intrinsics = f"{{file: {intrinsics}, readout_s: {readout_s:g}}}"
-    return [
-        f"  {name}:",
-        *pictures,
-        f"    clock: {{offset_s: 0, sigma_s: {sigma_s}}}",
-        f"    intrinsics: {intrinsics}",
-    ]
+        found = {"file": f"{name}_keypoints.json", "format": "alphapose", "skeleton": "coco17"}
+        pictures = {"frame_times": {"file": f"{name}_frames.csv"}, "keypoints": found}
+    is_unknown = any(other.clock_offset_s for other in flight.drones)
+    lens = f"{name}_camera.yaml"
+    return {
+        **pictures,
+        "clock": {"offset_s": 0, "sigma_s": _UNKNOWN_CLOCK_SIGMA_S if is_unknown else 0},
+        "intrinsics": {"file": lens, "readout_s": readout_s} if readout_s else lens,
+    }
 
 
-def _poses(flight: SimulatedFlight, drone: SimulatedDrone, true_poses: bool) -> list[str]:
+def _poses(flight: SimulatedFlight, drone: SimulatedDrone, true_poses: bool) -> dict[str, object]:
     name, drones = drone.name, flight.scenario.drones
     if true_poses:
-        return [f"    pose: {{file: truth/{name}.tum}}"]
-    arm = ", ".join(f"{v:g}" for v in LEVER_ARM)
-    lines = [
-        f"    pose: {{file: {name}, topic: /{name}/odometry, of: body}}",
-        f"    mount: {{looks: forward, translation: [{arm}]}}",
-        f"    gimbal: {{file: {name}, topic: /{name}/gimbal, relative_to: world}}",
-    ]
-    if drones.pose_noise and drones.state_pose_noise:
-        lines.append("    pose_noise:")
-        for model, parameters in drones.pose_noise.items():
-            stated = ", ".join(f"{key}: {value}" for key, value in parameters.items())
-            lines.append(f"      {model}: {{{stated}}}")
-    return lines
+        return {"pose": {"file": f"truth/{name}.tum"}}
+    noise = {model: dict(of) for model, of in drones.pose_noise.items() if drones.state_pose_noise}
+    return {
+        "pose": {"file": name, "topic": f"/{name}/odometry", "of": "body"},
+        "mount": {"looks": "forward", "translation": list(LEVER_ARM)},
+        "gimbal": {"file": name, "topic": f"/{name}/gimbal", "relative_to": "world"},
+        **({"pose_noise": noise} if noise else {}),
+    }
 
 
 # The recorder on board receives a message about 2 ms after its own stamp.
