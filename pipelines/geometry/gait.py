@@ -115,8 +115,6 @@ def _events_of(
     start: int, hips: Float, heels: Float, toes: Float, rate_hz: float
 ) -> list[tuple[int, int, bool, Float, float, float]]:
     """Find the events of one run: row, side, strike or not, foot, length of the step, speed."""
-    from scipy.signal import find_peaks
-
     trend = _low_pass(hips[:, :2], _TREND_HZ, rate_hz)
     velocity = np.gradient(trend, 1 / rate_hz, axis=0)
     speed = np.linalg.norm(velocity, axis=1)
@@ -126,7 +124,7 @@ def _events_of(
         for is_strike, feet in ((True, heels), (False, toes)):
             ahead = np.einsum("td,td->t", feet[side, :, :2] - hips[:, :2], forward)
             smooth = _low_pass(ahead, _CUTOFF_HZ, rate_hz)
-            rows, _ = find_peaks(smooth if is_strike else -smooth, prominence=_MIN_SWING_M)
+            rows = _peaks(smooth if is_strike else -smooth, _MIN_SWING_M)
             for row in rows[speed[rows] >= _MIN_SPEED_MPS].tolist():
                 apart = heels[side, row, :2] - heels[1 - side, row, :2]
                 length = float(apart @ forward[row])
@@ -134,14 +132,39 @@ def _events_of(
     return found
 
 
+def _peaks(values: Float, prominence: float) -> Int64:
+    """Find the rows of maxima that stand out by so much on both sides, up to the next higher value."""
+    rises = np.diff(values)
+    found = []
+    for row in (1 + np.flatnonzero((rises[:-1] > 0) & (rises[1:] <= 0))).tolist():
+        (higher,) = np.nonzero(values > values[row])
+        place = int(np.searchsorted(higher, row))
+        begin, end = np.concatenate([[-1], higher, [len(values)]])[place : place + 2]
+        lowest = max(values[begin + 1 : row].min(), values[row + 1 : end].min())
+        found += [row] if values[row] - lowest >= prominence else []
+    return np.array(found, dtype=np.int64)
+
+
 def _low_pass(values: Float, cutoff_hz: float, rate_hz: float) -> Float:
-    """Filter along the first axis, without delay (Butterworth, fourth order in all)."""
-    from scipy.signal import butter, sosfiltfilt
+    """Filter along the first axis, without delay: Butterworth's second order, forwards and backwards.
+
+    Both passes have the gain 1 / (1 + (tan(w / 2) / tan(c / 2))^4). So has the least of
+    |S (x - y)|^2 + |D x|^2 / tan(c / 2)^4, with sums S and differences D of second order; its ends are free.
+    """
+    from scipy.linalg import solveh_banded
 
     if cutoff_hz >= 0.45 * rate_hz:
         return values
-    sections = butter(2, cutoff_hz, fs=rate_hz, output="sos")
-    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=min(len(values) - 1, round(rate_hz))))
+    stiffness = np.tan(np.pi * cutoff_hz / rate_hz) ** -4
+    count = len(values) - 2
+    band, right = np.zeros((3, len(values))), np.zeros_like(values)
+    summed = values[:-2] + 2 * values[1:-1] + values[2:]
+    for i, of in enumerate((1.0, 2.0, 1.0)):
+        right[i : i + count] += of * summed
+        for j, other in enumerate((1.0, 2.0, 1.0)[i:]):
+            sign = -1.0 if j == 1 else 1.0  # of neighbours in a difference
+            band[j, i : i + count] += of * other * (1.0 + sign * stiffness)
+    return np.asarray(solveh_banded(band, right, lower=True))
 
 
 def _with_steps(found: list[tuple[int, int, bool, Float, float, float]], t_ns: Int64) -> GaitEvents:
