@@ -61,16 +61,10 @@ METHODS = ("robust", "refined", "auto")
 SPECIAL: dict[str, tuple[str, Any]] = {
     "background": ("reconstruction.background._MOST_UNBOUND", -1.0),
     "ground": ("reconstruction.ground._FEWEST_PATCHES", 10**9),
-    "rotation levels in the ground": ("reconstruction.ground._rotation_level", lambda *_: np.inf),
     "cameras that stand": ("reconstruction.background._FEWEST_STANDING", 10**9),
     "joints without slow errors": ("reconstruction.refinement.refine.REMEMBERED", np.inf),
     "faster motion": ("reconstruction.refinement.refine._FAST_MOTION", 1.0),
-    "place as logged": ("reconstruction.refinement.refine._position_undetermined", lambda *_: False),
     "swaps over time": ("reconstruct._without_swaps", lambda cameras, _: (cameras, {})),
-    "swaps between views": (
-        "reconstruct.swaps_across_views",
-        lambda xy, *_: (np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2])), {}),
-    ),
 }
 """Special cases of `auto`: the name in pipelines that is replaced, and the value without the case."""
 GIVEN: tuple[Given, ...] = ("model", "nothing")

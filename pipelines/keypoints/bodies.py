@@ -9,9 +9,9 @@ where s is the distance, in standard deviations, at which the viewing rays of th
 other. It is bounded: a gross error weighs, and does not decide. A piece that goes on in its own picture is
 evidence, too, and so is the log of a person, as one more camera. Pieces of one camera at one time are two
 bodies. The bodies are the partition whose sum of evidence is greatest: pieces are joined, best first, then
-moved and exchanged while the sum rises. So two people who stood behind each other for one camera are told
-apart by all that was seen before and after it. If the rays of the bodies pass each other farther than their
-standard deviations say, these are enlarged, and the bodies made again.
+stretches of them are exchanged while the sum rises. So two people who stood behind each other for one camera
+are told apart by all that was seen before and after it. If the rays of the bodies pass each other farther
+than their standard deviations say, these are enlarged, and the bodies made again.
 """
 
 from typing import NamedTuple
@@ -47,8 +47,6 @@ _SHIFT_HEIGHTS = 0.15
 _CLEAR_SHIFT = 0.5
 # Evidence of a picture that goes on: as much as two or three times at which all cameras agree.
 _CONTINUITY = 20.0
-# A picture that goes on without any rival counts five times as much as one with rivals.
-_CLEAR_CONTINUITY = 100.0
 # The mean of the better three quarters of squares of one right pair has about this median.
 _USUAL_CHI2 = 0.4
 # The noise that is learned, by the stated one, squared: more of it hides people who stand beside each other.
@@ -65,14 +63,14 @@ _EXACT_POINT_M = 0.3
 _STRETCHES = 15
 # Only the places where most evidence is lost are tried.
 _BORDERS = 40
-# The pieces of a stretch are known after so many rounds, or the stretch is none.
-_STRADDLERS = 4
-# The second round of moves and exchanges changes little.
+# The second round of exchanges changes little.
 _ROUNDS = 4
 # Bodies are found in stretches of so much time, and known again in the next one by the time in common.
 _STRETCH_S, _OVERLAP_S = 20.0, 1.0
 # Arrays of this many pairs of detections take 30 MB of memory.
 _BLOCK = 20_000
+# Rays of this many times take 10 MB.
+_ROWS = 2_000
 
 
 class SightLines(NamedTuple):
@@ -252,8 +250,7 @@ def _continuity(time_s: Float, points: Float, size: Float, piece: Int64, nodes: 
         shift = np.full(wait_s.shape, np.inf)
         expected = points[t0, c, d0] + moved[:, None]
         shift[old, new] = _shifts(points[t1, c, d1], expected, size[t1, c, d1], wait_s[old, new])
-        clear = shift + _CLEAR_SHIFT <= np.minimum(_rivals(shift, 0), _rivals(shift, 1))
-        worth = np.where(clear, _CLEAR_CONTINUITY, _CONTINUITY) * (shift < 1.0) / (1.0 + (shift / 0.3) ** 2)
+        worth = _CONTINUITY * (shift < 1.0) / (1.0 + (shift / 0.3) ** 2)
         worth *= (_SHIFT_HEIGHTS / (_SHIFT_HEIGHTS + np.maximum(wait_s, 0.0))) ** 2
         old, new = np.nonzero(worth)
         found[names[old], names[new]] = found[names[new], names[old]] = worth[old, new]
@@ -364,13 +361,12 @@ class _Nodes(NamedTuple):
 
 def _partition(evidence: Float, apart: Bool, nodes: _Nodes, before: Int64 | None) -> Int64:
     """Divide N nodes into bodies, the sum of evidence [N, N] inside of them as large as is found."""
-    tried = []
-    begun = [_joined(evidence, apart), _in_order(evidence, apart, nodes)]
-    for first in begun if before is None else [*begun, before]:
+    tried: list[tuple[float, Int64]] = []
+    for first in [_joined(evidence, apart), *([] if before is None else [before])]:
         _, body = np.unique(first, return_inverse=True)
         for _ in range(_ROUNDS):
             old = body
-            body = _exchanged(evidence, apart, nodes, _settled(evidence, apart, body.copy()))
+            body = _exchanged(evidence, apart, nodes, body)
             if np.array_equal(body, old):
                 break
         tried.append((float(evidence[body[:, None] == body].sum()), body))
@@ -402,25 +398,6 @@ def _joined(evidence: Float, apart: Bool) -> Int64:
     return body
 
 
-def _in_order(evidence: Float, apart: Bool, nodes: _Nodes) -> Int64:
-    """Give each node, as it begins, to the body that it fits best."""
-    count = len(evidence)
-    body, bodies = np.full(count, -1), 0
-    support, blocked = np.zeros((count, count)), np.zeros((count, count), np.bool_)
-    for start in np.unique(nodes.start).tolist():
-        left = np.flatnonzero(nodes.start == start)
-        while len(left):
-            fits = np.where(blocked[left, :bodies], -np.inf, support[left, :bodies])
-            k, to = np.unravel_index(fits.argmax(), fits.shape) if bodies else (0, 0)
-            if not bodies or not fits[k, to] > 0:
-                k, to, bodies = 0, bodies, bodies + 1
-            body[left[k]] = to
-            support[:, to] += evidence[:, left[k]]
-            blocked[:, to] |= apart[:, left[k]]
-            left = np.delete(left, k)
-    return body
-
-
 def _exchanged(evidence: Float, apart: Bool, nodes: _Nodes, body: Int64) -> Int64:
     """Let stretches of one camera, or of all, change their bodies together, while the sum rises."""
     count = int(body.max(initial=-1)) + 1
@@ -440,53 +417,17 @@ def _exchanged(evidence: Float, apart: Bool, nodes: _Nodes, body: Int64) -> Int6
         for k, begin in enumerate(borders[:-1]):
             for end in {*borders[k + 1 : k + _STRETCHES], last}:
                 moved = own & (nodes.middle >= begin) & (nodes.middle < end)
-                for _ in range(_STRADDLERS):
-                    over = moved[far] & ~moved[near]
-                    ends = body[near[over]] * count + body[far[over]]
-                    links = np.bincount(ends, value[over], count**2).reshape(count, count)
-                    stays, leaves = linear_sum_assignment(links, maximize=True)
-                    if links[stays, leaves].sum() <= np.trace(links) + 1e-6:
-                        break
-                    to = np.empty(count, np.int64)
-                    to[leaves] = stays
-                    tried = np.where(moved, to[body], body)
-                    clash = tried[beside[0]] == tried[beside[1]]
-                    if not clash.any():
-                        body = tried
-                        break
-                    # Pieces that straddle a border go along.
-                    moved[beside[0][clash]] = moved[beside[1][clash]] = True
-    return body
-
-
-def _settled(evidence: Float, apart: Bool, body: Int64) -> Int64:
-    """Move single nodes, or exchange two that are apart, while the sum rises."""
-    count = int(body.max(initial=-1)) + 1
-    member = np.zeros((len(body), count))
-    member[np.arange(len(body)), body] = 1.0
-    support, blocked = evidence @ member, apart.astype(np.float64) @ member
-    one, other = np.nonzero(np.triu(apart, 1))
-    for _ in range(2 * len(body)):
-        own = support[np.arange(len(body)), body]
-        move = np.where(blocked == 0, support - own[:, None], -np.inf)
-        move[np.arange(len(body)), body] = -np.inf
-        k, to = np.unravel_index(move.argmax(), move.shape) if move.size else (0, 0)
-        gain = float(move[k, to]) if move.size else 0.0
-        free = (blocked[one, body[other]] == 1) & (blocked[other, body[one]] == 1)
-        exchange = np.where(
-            free, support[one, body[other]] + support[other, body[one]] - own[one] - own[other], -np.inf
-        )
-        changes = [(int(k), int(to))]
-        if exchange.max(initial=-np.inf) > gain:
-            gain, at = float(exchange.max()), int(exchange.argmax())
-            changes = [(int(one[at]), int(body[other[at]])), (int(other[at]), int(body[one[at]]))]
-        if gain <= 1e-6:
-            break
-        for node, new in changes:
-            for of, column in ((body[node], -1.0), (new, 1.0)):
-                support[:, of] += column * evidence[:, node]
-                blocked[:, of] += column * apart[:, node]
-            body[node] = new
+                over = moved[far] & ~moved[near]
+                ends = body[near[over]] * count + body[far[over]]
+                links = np.bincount(ends, value[over], count**2).reshape(count, count)
+                stays, leaves = linear_sum_assignment(links, maximize=True)
+                if links[stays, leaves].sum() <= np.trace(links) + 1e-6:
+                    continue
+                to = np.empty(count, np.int64)
+                to[leaves] = stays
+                tried = np.where(moved, to[body], body)
+                if (tried[beside[0]] != tried[beside[1]]).all():
+                    body = tried
     return body
 
 
@@ -524,26 +465,25 @@ def _placed(views: SightLines, seen: Bool, track: Int64, order: Int64) -> Bodies
         rows = np.flatnonzero(with_camera.any(axis=1))
         cameras = with_camera[rows].sum(axis=1)
         count[rows] = np.where(mine[rows], cameras[:, None, None], count[rows])
-        rows = rows[cameras > 1]
-        if not len(rows):
-            continue
-        detection = mine[rows].argmax(axis=2)
-        at = (rows[:, None], np.arange(shape[1]), detection)
-        position = np.nan_to_num(views.position[rows])
-        rays = np.moveaxis(rays_of(views.xy[at], views.rotation[rows]), 2, 1)  # [R, J, C, 3]
-        sigma = np.where(with_camera[rows], views.sigma[rows], np.inf)
-        weight = np.where(np.moveaxis(seen[at], 2, 1), 1.0 / sigma[:, None] ** 2, 0.0)
-        points, _ = meeting_points(rays, np.broadcast_to(position[:, None], rays.shape), weight)
-        place = known_median(points, axis=1)
-        sight = place[:, None] - position
-        reach = np.maximum(np.linalg.norm(sight, axis=-1), 1e-6)
-        weight = 1.0 / (sigma * reach) ** 2
-        known, normal = meeting_points(sight / reach[..., None], position, np.nan_to_num(weight))
-        error = np.sqrt(np.trace(np.linalg.inv(normal), axis1=-2, axis2=-1) / 3.0)
-        error = np.where(np.isfinite(known).all(axis=-1), error, np.nan)
-        place = np.where(np.isfinite(error)[:, None], place, np.nan)
-        spread[rows] = np.where(mine[rows], error[:, None, None], spread[rows])
-        middle[rows] = np.where(mine[rows][..., None], place[:, None, None], middle[rows])
+        several = rows[cameras > 1]
+        for rows in (several[k : k + _ROWS] for k in range(0, len(several), _ROWS)):
+            detection = mine[rows].argmax(axis=2)
+            at = (rows[:, None], np.arange(shape[1]), detection)
+            position = np.nan_to_num(views.position[rows])
+            rays = np.moveaxis(rays_of(views.xy[at], views.rotation[rows]), 2, 1)  # [R, J, C, 3]
+            sigma = np.where(with_camera[rows], views.sigma[rows], np.inf)
+            weight = np.where(np.moveaxis(seen[at], 2, 1), 1.0 / sigma[:, None] ** 2, 0.0)
+            points, _ = meeting_points(rays, np.broadcast_to(position[:, None], rays.shape), weight)
+            place = known_median(points, axis=1)
+            sight = place[:, None] - position
+            reach = np.maximum(np.linalg.norm(sight, axis=-1), 1e-6)
+            weight = 1.0 / (sigma * reach) ** 2
+            known, normal = meeting_points(sight / reach[..., None], position, np.nan_to_num(weight))
+            error = np.sqrt(np.trace(np.linalg.inv(normal), axis1=-2, axis2=-1) / 3.0)
+            error = np.where(np.isfinite(known).all(axis=-1), error, np.nan)
+            place = np.where(np.isfinite(error)[:, None], place, np.nan)
+            spread[rows] = np.where(mine[rows], error[:, None, None], spread[rows])
+            middle[rows] = np.where(mine[rows][..., None], place[:, None, None], middle[rows])
     parts = (np.take_along_axis(part, order, 2) for part in (track, count, spread))
     track, count, spread = parts
     return Bodies(track, count, np.take_along_axis(middle, order[..., None], 2), spread)

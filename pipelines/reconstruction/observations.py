@@ -40,8 +40,6 @@ class ErrorModes:
     t_ns: Int64  # [S], two or more
     response: Float  # [S, 6, R] of position in the world (m) and rotation vector in the camera (rad)
     shift_m: float  # standard deviation of the constant shift
-    turn: Float  # [3] rad, the mean rotation error that was found and taken off
-    turn_sigma: float  # its standard deviation before, rad
 
     def at(self, t_ns: Int64) -> Float:
         """Interpolate the response [..., 6, R] at times [...] ns; beyond the ends, the nearest."""
@@ -79,14 +77,6 @@ class Camera:
     def focal_px(self) -> float:
         """Mean focal length (px), to convert pixels to angles."""
         return (self.intrinsics.fx + self.intrinsics.fy) / 2
-
-    @cached_property
-    def field(self) -> Float:
-        """Left, top, right and bottom of its picture [4] as undistorted normalised image coordinates."""
-        right, bottom = self.intrinsics.width - 1.0, self.intrinsics.height - 1.0
-        x, y = right / 2, bottom / 2
-        middles = undistort(np.array([[0.0, y], [x, 0.0], [right, y], [x, bottom]]), self.intrinsics)
-        return middles[np.arange(4), [0, 1, 0, 1]]
 
     def seen(self) -> tuple[Float, Float]:
         """Compute its keypoints: rays [F, D, J, 2], NaN where nothing was found; confidences [F, D, J]."""
@@ -248,14 +238,6 @@ def observe(
         rotation=rotation,
         pose_sigma=pose_sigma,
     )
-
-
-def on_sides(rays: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
-    """Give each joint [T, P, J, ...] the view of the joint in `sides`, -1 for none: NaN and 0 then."""
-    kept, joint = sides >= 0, np.maximum(sides, 0)
-    own_xy = np.take_along_axis(rays, joint[..., None], axis=2)
-    own_confidence = np.take_along_axis(confidence, joint, axis=2)
-    return np.where(kept[..., None], own_xy, np.nan), np.where(kept, own_confidence, 0.0)
 
 
 def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:

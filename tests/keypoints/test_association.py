@@ -16,21 +16,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import undistort
-from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.keypoints.association import (
     Association,
-    Surroundings,
     associate,
     associate_one_camera,
-    without_common_errors,
 )
-from pipelines.keypoints.bodies import SightLines, find_bodies
-from pipelines.keypoints.corrections import Pair, mirrored_pairs, swaps_across_views
-from pipelines.reconstruction.observations import on_sides
-from pipelines.simulation.detector_errors import see
-from tests.synthetic.flights import LENS
-from tests.synthetic.walk import COCO17, walk
+from pipelines.keypoints.bodies import SightLines
 
 Int64 = NDArray[np.int64]
 Path = Callable[[Float], Float]  # seconds [T] to places on the ground [T, 2]
@@ -54,10 +45,8 @@ class Scene:
     sigma: Float
     who: Int64 = field(repr=False)  # [T, C, D] the person, -1 none
 
-    def associate(
-        self, people: int | None = 1, *logs: Path, sigma_m: float = 0.5, reach: float = 1.0
-    ) -> Association:
-        heights, cameras = np.ones(len(self.time_s)), self.xy.shape[1]
+    def associate(self, people: int | None = 1, *logs: Path, sigma_m: float = 0.5) -> Association:
+        heights = np.ones(len(self.time_s))
         actors = [np.c_[log(self.time_s), heights] for log in logs]
         return associate(
             self.time_s,
@@ -69,9 +58,7 @@ class Scene:
             actors=np.stack(actors, axis=1) if actors else None,
             actor_sigma_m=sigma_m,
             people=people,
-            scene=None
-            if people
-            else Surroundings(_level, np.tile([-reach, -reach, reach, reach], (cameras, 1))),
+            ground=None if people else _level,
         )
 
     def chosen(self, result: Association, person: int = 0) -> Int64:
@@ -323,22 +310,6 @@ def test_phantoms_are_refused_and_counted(cause: str, shape: Shape) -> None:
     assert sorted(int(np.bincount(own[own >= 0]).argmax()) for own in who) == [0, 2]
 
 
-@pytest.mark.parametrize("away_m", [13.0, 7.0])
-def test_a_bystander_stands_beyond_the_cameras_and_is_never_in_all_pictures(away_m: float) -> None:
-    """Let two opposite cameras see somebody behind camera 0, or in front of it, where they are a person.
-
-    The cameras stand 9.7 m from the middle of the actor's way, and show 45 degrees to each side.
-    """
-    stands = straight((away_m * np.cos(0.3), away_m * np.sin(0.3)), (0.0, 0.0))
-    scene = film([straight((-0.5, 0.0), (0.2, 0.0)), stands])
-    for camera in (0, 1, 4):
-        scene = scene.hide(1, camera)
-    result = scene.associate(None)
-    behind = away_m > RANGE_M
-    assert result.choice.shape[2] == (1 if behind else 2)
-    assert result.phantoms == ({"bystander": 1} if behind else {})
-
-
 def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> None:
     """Hide the actor in one camera for good: the bystander there is refused and counted."""
     bystander = straight((1.0, 2.0), (0.0, 0.0))
@@ -410,40 +381,6 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
 BESIDE = straight((-3.0, 1.5), (1.0, 0.0))
 
 
-def disagreement(scene: Scene, views: SightLines, person: int) -> float:
-    """Compute the root mean square, in sigma of the scene, of a person's rays about their nearest points."""
-    squares = []
-    for t in range(0, len(scene.time_s), 10):
-        rays, origins = [], []
-        for c in range(scene.xy.shape[1]):
-            (d,) = np.flatnonzero(scene.who[t, c] == person)
-            ray = np.c_[views.xy[t, c, d], np.ones(views.xy.shape[3])] @ views.rotation[t, c].T
-            rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-            origins.append(np.broadcast_to(views.position[t, c], ray.shape))
-        across = np.eye(3) - np.einsum("cji,cjk->cjik", rays, rays)
-        target = np.einsum("cjik,cjk->ji", across, np.array(origins))
-        points = np.linalg.solve(across.sum(axis=0), target[..., None])[..., 0]
-        off = np.einsum("cjik,cjk->cji", across, points - np.array(origins))
-        away = np.linalg.norm(points - np.array(origins), axis=-1)
-        squares.append((np.linalg.norm(off, axis=-1) / away / scene.sigma[0, 0]) ** 2)
-    return float(np.sqrt(np.mean(squares)))
-
-
-def test_the_views_of_others_agree_without_the_errors_that_the_first_person_shows() -> None:
-    """Turn each of three cameras by 1 degree, which moves everybody in a picture by about the same.
-
-    What is left is the keypoints' noise (0.11 sigma) and the turn about the optical axis (0.15 sigma at 1.5 m
-    from the middle of the picture).
-    """
-    scene = film([ACTOR, BESIDE], cameras=3, bias=(0.0, 1.0), seed=3)
-    views = SightLines(scene.xy, scene.confidence, scene.position, scene.rotation, scene.sigma)
-    seen = find_bodies(scene.time_s, views)
-    corrected = without_common_errors(scene.time_s, views, seen)
-    assert disagreement(scene, views, 1) > 1.0
-    assert disagreement(scene, corrected, 1) < np.hypot(0.11, 0.15) * 1.1
-    assert (corrected.sigma < views.sigma).all()
-
-
 def test_people_are_told_apart_under_constant_pose_errors() -> None:
     """Let three people cross, with 3 cameras, 0.3 m and 1 deg: 0.0035 of the choices are wrong."""
     across = straight((0.5, -3.0), (0.0, 1.1))
@@ -465,86 +402,3 @@ def test_nobody_is_lost_where_keypoints_err_more_than_stated() -> None:
     assert sorted(int(np.bincount(own[own >= 0]).argmax()) for own in chosen) == [0, 1, 2]
     right = sum(np.bincount(own[own >= 0]).max() for own in chosen)
     assert right > 0.99 * (noisy.who >= 0).sum()
-
-
-NOISE_PX = 2.0
-T_S = np.arange(150) / 15
-PAIRS = mirrored_pairs(COCO17)
-LEGS = [PAIRS[f"left_{part}"] for part in ("hip", "knee", "ankle")]
-SIGMA = NOISE_PX / LENS.fx
-
-
-class Views:
-    """Views of cameras on a ring of 10 m; pixels of [C, T, 17, 2]."""
-
-    def __init__(self, cameras: int, noise_px: float = NOISE_PX) -> None:
-        joints = walk(T_S, radius_m=2.0)
-        turn = 2 * np.pi * np.arange(cameras) / cameras if cameras > 2 else np.radians([0.0, 100.0])
-        places = np.stack([10 * np.cos(turn), 10 * np.sin(turn), np.full(cameras, 4.0)], axis=1)
-        position = np.repeat(places[:, None], len(T_S), axis=1)
-        quaternion = look_at(position, joints[None, :, 11])
-        pixels = np.stack([see(joints, p, q, LENS) for p, q in zip(position, quaternion, strict=True)])
-        self.pixels = pixels + np.random.default_rng(0).normal(0.0, noise_px, pixels.shape)
-        self.position = np.moveaxis(position, 0, 1)
-        self.rotation = np.moveaxis(matrix_from_quaternion(quaternion), 0, 1)
-        self.sigma = np.full((len(T_S), cameras), SIGMA)
-        self.xy = np.moveaxis(undistort(self.pixels, LENS), 0, 2)
-
-    def undone(self, xy: Float) -> tuple[Float, dict[str, int]]:
-        sides, counts = swaps_across_views(xy, self.position, self.rotation, self.sigma, COCO17)
-        seen = np.ones(xy.shape[:-1])
-        found, kept = (values[:, 0] for values in on_sides(xy[:, None], seen[:, None], sides[:, None]))
-        assert ((sides >= 0) == (kept == 1)).all()
-        return found, counts
-
-
-def exchanged(xy: Float, camera: int, rows: slice, pairs: list[Pair]) -> Float:
-    swapped = xy.copy()
-    for left, right in pairs:
-        swapped[rows, left, camera], swapped[rows, right, camera] = (
-            xy[rows, right, camera],
-            xy[rows, left, camera],
-        )
-    return swapped
-
-
-@pytest.mark.parametrize("cameras", [2, 3, 5])
-@pytest.mark.parametrize("noise_px", [0.0, 2.0])
-def test_views_that_agree_stay_to_the_last_bit(cameras: int, noise_px: float) -> None:
-    views = Views(cameras, noise_px)
-    found, counts = views.undone(views.xy)
-    np.testing.assert_array_equal(found, views.xy)
-    assert counts == {}
-
-
-@pytest.mark.parametrize("cameras", [3, 4, 5])
-@pytest.mark.parametrize("pairs", [list(PAIRS.values()), LEGS], ids=["whole body", "legs"])
-def test_an_exchange_in_one_camera_is_undone(cameras: int, pairs: list[Pair]) -> None:
-    views = Views(cameras)
-    found, counts = views.undone(exchanged(views.xy, 1, slice(20, 120), pairs))
-    # Left and right are apart along the horizon, where three cameras have three rays for two unknowns: a pair
-    # that is s apart misses by s / 3 in the exchanged camera, in more cameras by more. Over the six rays of
-    # the legs that makes m = 2 / 9 of the squared distances, in variances of a coordinate, with a deviation
-    # of 2 sqrt(m). Seen are 6 * 5 of them: with four deviations on top m = 116, or 522.
-    apart = views.pixels[1]
-    distance2 = np.sum([((apart[:, a] - apart[:, b]) ** 2).sum(-1) for a, b in LEGS], axis=0)
-    visible = np.zeros(len(T_S), np.bool_)
-    visible[20:120] = distance2[20:120] > 522 * NOISE_PX**2
-    assert visible.sum() > 20
-    legs = np.ravel(LEGS)
-    restored = (found[:, legs] == views.xy[:, legs]).all(axis=(1, 2, 3))
-    assert restored[visible].mean() >= 0.95
-    outside = np.r_[0:20, 120:150]
-    np.testing.assert_array_equal(found[outside], views.xy[outside])
-    assert counts["undone"] >= 2 * len(LEGS) * restored[visible].sum()
-
-
-def test_of_two_cameras_neither_is_believed() -> None:
-    views = Views(2)
-    found, counts = views.undone(exchanged(views.xy, 1, slice(20, 120), LEGS))
-    assert counts.keys() == {"dropped"}
-    dropped = np.asarray(np.isnan(found).any(axis=(1, 2, 3)))
-    assert dropped[20:120].mean() > 0.1
-    assert not dropped[:20].any()
-    assert not dropped[120:].any()
-    assert (np.isnan(found).any(-1).all(-1) == np.isnan(found).any(-1).any(-1)).all()  # both views or none

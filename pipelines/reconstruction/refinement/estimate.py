@@ -38,10 +38,8 @@ BOUND = 3.5
 
 
 # A step that moves joints by less than this changes no figure.
-_CONVERGED_M = 2e-4
+_CONVERGED_M = 5e-4
 BOUNDS = (20.0, 8.0, BOUND)
-# The linearisation in the body's size is not valid for a larger step.
-_MOST_GROWTH = 0.15
 # Of a step, no smaller share is tried; that is made even if it raises the cost.
 _LEAST = 0.01
 # The first bounds are so many times the usual residual of the start, because poses are not corrected yet.
@@ -55,12 +53,10 @@ def solve(
     *,
     rounds: int,
     bounds: tuple[float, ...] = BOUNDS,
-    most_growth: float = np.inf,
 ) -> tuple[System, State, Eliminated]:
     """Solve by Gauss-Newton, with steps halved if the cost would rise and a robust bound that tightens.
 
-    A step that would change the logarithm of the body's size by more than `most_growth` is shortened by the
-    ratio. The equations returned are those of the last step, within a step of the state.
+    The equations returned are those of the last step, within a step of the state.
     """
     layout = lay_out(known.poses, known.clock_sigma_s, len(problem.bones), problem.knot_t_s)
     done = 0
@@ -76,24 +72,14 @@ def solve(
         at = eliminate(system, state)
         direction = step(system, at)
         most = cost(system, state) * (1 + 1e-9)
-        growth = _growth(system, state, direction)
-        whole = share = most_growth / growth if growth > most_growth else 1.0
-        while share > _LEAST * whole and not cost(system, state.moved(direction, share)) <= most:
+        share = 1.0
+        while share > _LEAST and not cost(system, state.moved(direction, share)) <= most:
             share /= 2
         state = state.moved(direction, share)
         moved = float(np.sqrt(np.mean((share * direction.position) ** 2)))
         if done >= rounds or (moved < _CONVERGED_M and done >= len(bounds)):
             return system, state, at
         del at  # otherwise the factors of two rounds would be in memory together
-
-
-def _growth(system: System, state: State, direction: State) -> float:
-    """Compute the absolute change of the logarithm of the mean bone length by a step."""
-    column = system.layout.bone_column
-    lengths, changes = state.shared[column:], direction.shared[column:]
-    if not len(lengths):
-        return 0.0
-    return abs(float(np.log(max(1.0 + changes.mean() / lengths.mean(), _LEAST))))
 
 
 def cost(system: System, state: State) -> float:
@@ -110,18 +96,13 @@ def learn(
     keypoints count less by that factor against slow pose errors. If it exceeds `REMEMBERED`, motion and image
     noise, which vary quickly, are no longer estimated.
 
-    New levels change an estimate little, except for the size of a nearly constant formation: it may change
-    only a little in a step, and more steps would let it diverge.
-
     `poses` and `memory` are True to estimate the levels of pose errors, and the memory of keypoints.
     """
     for index in range(rounds):
         if index == 0:
             system, state, at = solve(problem, known, state, rounds=len(BOUNDS))
         else:
-            system, state, at = solve(
-                problem, known, state, rounds=1, bounds=(BOUND,), most_growth=_MOST_GROWTH
-            )
+            system, state, at = solve(problem, known, state, rounds=1, bounds=(BOUND,))
         known = reestimated(system, state, at, poses=poses, motion=known.memory < REMEMBERED)
         del at  # as in `solve`
         if memory and index == rounds // 2:
@@ -288,7 +269,7 @@ def _process(process: Process, places: list[tuple[bool, int]], found: Moments, k
 _LONGEST_S = 2.0
 # A smaller autocorrelation is chance, and the sum stops there.
 _STOPS = 0.02
-# A longer memory cannot be measured in stretches of a hundred times.
+# A longer memory cannot be measured in stretches of sixty times.
 _MOST = 30.0
 
 

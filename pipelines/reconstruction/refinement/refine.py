@@ -13,7 +13,6 @@ from pipelines.geometry.noise import (
     SURVEYED_M,
     UNKNOWN_SIGMA,
     USUAL_CONSTANT,
-    USUAL_COUNT,
     PoseErrors,
     Process,
 )
@@ -36,8 +35,9 @@ from pipelines.reconstruction.refinement.system import (
     misfit,
 )
 
-# The prior is learned from all of a flight of so many times, and from stretches of a longer one.
-_WHOLE_TIMES, _WINDOWS, _WINDOW = 400, 3, 100
+# The prior is learned from all of a flight of so many times, and from stretches of a longer one. Flights of
+# 6 s show that 180 times are enough.
+_WHOLE_TIMES, _WINDOWS, _WINDOW = 200, 3, 60
 # Learning ends after this many rounds, converged or not.
 _LEARNING_ROUNDS = 8
 # Estimates converge in fewer rounds.
@@ -57,10 +57,6 @@ SETTLED_S = 2e-3
 _UNEXPLAINED = 1.15
 # Right flights are not so many standard deviations from their prior.
 _SIGMAS = 4.0
-# Estimates under other levels converge in so many rounds.
-_SETTLING = 4
-# Levels of constant errors settle in so many rounds.
-_LEVEL_ROUNDS = 3
 # Constant errors have this share of the usual level where the pictures let the scene grow.
 _HELD = 0.1
 # Detectors place joints to 1 % of a person's height (simulation/data/blazepose_errors.csv). What varies of
@@ -92,8 +88,6 @@ _FARTHEST_STATED = 3.2
 sqrt(30.7 / 3): the root of a chi-square variable with three degrees of freedom over three exceeds it once in
 a million times.
 """
-_DETERMINED_PLACE = 0.7
-"""Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
 PLACED_AS_LOGGED = (
     "refined: the videos do not determine the person's absolute position; it is taken from the logged poses "
@@ -217,8 +211,6 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
-    assumed = any(errors.assumed for errors in known.poses)
-    as_logged = prior.learned and not assumed and _position_undetermined(system, state, at, covariance)
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
@@ -226,8 +218,8 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
         pictures = system.problem.pictures
         position, rotation = corrected(pictures.position, pictures.rotation, numbers)
         still = replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
-        own, state = _joints_without_slow_errors(still, state.position, known, measured=measured)
-        covariance = _with_own(covariance, own, state)
+        remembering, state, own = _joints_without_slow_errors(still, state.position, known, measured=measured)
+        covariance = _with_own(covariance, own, remembering, state)
     joints = state.position
     moved_m = float(np.median(np.linalg.norm(joints - views.start, axis=-1)))
     fallback = doubts
@@ -235,7 +227,7 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
         fallback = (
             f"the skeleton would move by {moved_m:.2f} m where the views let expect {prior.expected_m:.2f} m"
         )
-    as_logged = as_logged or prior.held_m > 0
+    as_logged = prior.held_m > 0
     shift = np.median(views.start - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     return Refined(
         position=joints + shift,
@@ -273,14 +265,16 @@ def _spread_of(cameras: int) -> float:
 
 def _joints_without_slow_errors(
     problem: Problem, start: Float, known: Knowledge, *, measured: bool
-) -> tuple[tuple[System, System], State]:
+) -> tuple[System, State, Float]:
     """Estimate the joints after the removal of slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less. That is right for slow errors and
     wrong for limbs: their motion would be smoothed away. Clocks and the motion that depends on them stay
     unknowns.
 
-    Returns a system of the same poses in which correlated keypoints count less again, and the estimate.
+    Returns a system of the same poses in which correlated keypoints count less again, the estimate, and the
+    covariances [T, J, 3, 3] by keypoints: of the part that varies, which motion averages, and of the lasting
+    part, which residuals do not show and nothing averages.
     """
     knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
     levels = [(*errors.white_with_stray(knot_s), errors.logged) for errors in known.poses]
@@ -289,23 +283,21 @@ def _joints_without_slow_errors(
     faster = 1.0 if measured else _FAST_MOTION**2  # kicks would be smoothed
     weighted = replace(known, memory=1.0, acceleration=faster * known.acceleration)
     initial = initial_state(problem, weighted, start)
-    solved, found, _ = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
-    return (System(problem, known, solved.layout, BOUND**2), solved), found
+    solved, found, at = solve(problem, weighted, initial, rounds=4, bounds=(BOUND,))
+    own = covariances(solved, at) + _of_lasting_errors(solved, found.position)
+    return System(problem, known, solved.layout, BOUND**2), found, own
 
 
-def _with_own(covariance: Float, systems: tuple[System, System], state: State) -> Float:
-    """Compute covariances [T, J, 3, 3] of joints: each has its own error, and one by slow pose errors.
+def _with_own(covariance: Float, own: Float, remembering: System, state: State) -> Float:
+    """Compute covariances [T, J, 3, 3] of joints: each has its `own` error, and one by slow pose errors.
 
-    A joint's own error is the part that varies, which motion averages, and the lasting part of its keypoints,
-    which residuals do not show and nothing averages. `systems` are without slow pose errors; in the first,
-    correlated keypoints count less, as in the estimate of joints and cameras together.
+    The system is without slow pose errors; correlated keypoints count less in it, as in the estimate of
+    joints and cameras together.
     """
-    remembering, weighted = systems
     by_poses = covariance - covariances(remembering, eliminate(remembering, state))
     variance, axes = np.linalg.eigh(0.5 * (by_poses + by_poses.swapaxes(-1, -2)))
     by_poses = np.einsum("tjik,tjk,tjlk->tjil", axes, np.maximum(variance, 0.0), axes)
-    own = covariances(weighted, eliminate(weighted, state))
-    return np.asarray(own + by_poses + _of_lasting_errors(weighted, state.position))
+    return np.asarray(own + by_poses)
 
 
 def _of_lasting_errors(system: System, position: Float) -> Float:
@@ -422,7 +414,7 @@ def _priors(
 def _known_prior(
     problem: Problem, start: Float, prior: Sequence[PoseErrors], clock_sigma_s: Float
 ) -> Iterator[_Prior]:
-    """Yield priors with known pose errors: assumed constants of estimated or usual levels, or as logged."""
+    """Yield priors with known pose errors: assumed constants of usual levels, or as logged."""
     guess, _, disagreement_m, range_m = _first_guess(problem, start)
     unlearned = _unlearned(problem, start, tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start)
@@ -437,54 +429,15 @@ def _known_prior(
     if not any(errors.assumed for errors in prior):
         yield _Prior(known, state, False, (), expected_m)
         return
-    usual, usual_m = _usual_levels(guessed), _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
-    found = _with_constant_levels(problem, known, state, guessed)
-    if found is not None:
-        yield _Prior(found, state, True, (), expected_m)
+    # Usual levels of constant errors, or those guessed from the views if they are smaller.
+    usual = {kind: min(USUAL_CONSTANT[kind], sigma) for kind, sigma in guessed.items()}
+    usual_m = _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
     if disagreement_m < _SIGMAS * usual_m:
         yield _Prior(_of_levels(known, usual), state, False, (), expected_m)
     held = _of_levels(known, {kind: _HELD * sigma for kind, sigma in usual.items()})
     # Errors are as large as usual, or as the views disagree if that is more.
     held_m = _spread_of(len(prior)) * max(usual_m, disagreement_m) / np.sqrt(3)
     yield _Prior(held, state, False, (), expected_m, held_m)
-
-
-def _usual_levels(guessed: Mapping[int, float]) -> dict[int, float]:
-    """Return usual levels of constant errors by kind, or those guessed from the views if they are smaller."""
-    return {kind: min(USUAL_CONSTANT[kind], sigma) for kind, sigma in guessed.items()}
-
-
-def _with_constant_levels(
-    problem: Problem, known: Knowledge, state: State, guessed: Mapping[int, float]
-) -> Knowledge | None:
-    """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
-
-    A few numbers say little of a level: a usual level counts as `USUAL_COUNT` more. None exceeds the one that
-    the views' disagreement gives. None is returned where the scene would grow to fit the detector's errors.
-    """
-    for _ in range(_LEVEL_ROUNDS):
-        system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
-        variance = np.diagonal(shared_covariance(system, at))
-        del at  # factors of two estimates would be in memory together
-        found: dict[int, list[tuple[float, float]]] = {}
-        for (camera, process), (at_knots, column) in zip(
-            system.layout.processes, system.layout.place, strict=True
-        ):
-            if _is_assumed(known.poses[camera], process) and not at_knots:
-                kind = 1 if process.number == ROTATION else 0
-                own = slice(column, column + 3)
-                determined = float(np.sum(1 - variance[own] / process.sigma0**2))
-                found.setdefault(kind, []).append((float(np.sum(state.shared[own] ** 2)), determined))
-        level, usual = {}, _usual_levels(guessed)
-        for kind, parts in found.items():
-            squares, determined = np.sum(parts, axis=0)
-            usual2 = usual[kind] ** 2
-            level[kind] = np.sqrt((squares + USUAL_COUNT * usual2) / (max(determined, 0.0) + USUAL_COUNT))
-        if any(sigma > UNKNOWN_SIGMA[kind] for kind, sigma in level.items()):
-            return None
-        known = _of_levels(known, {kind: min(sigma, guessed[kind]) for kind, sigma in level.items()})
-    system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
-    return None if _scale_unseen(system, state, at) else known
 
 
 def _is_assumed(errors: PoseErrors, process: Process) -> bool:
@@ -629,25 +582,6 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
         if surprise > _SIGMAS and not at_knots:
             return f"camera {camera + 1} would be {surprise:.0f} standard deviations from its logged poses"
     return None
-
-
-def _position_undetermined(system: System, state: State, at: Eliminated, covariance: Float) -> bool:
-    """Test if the person's absolute position is not determined by the pictures.
-
-    Constant errors are only a few numbers, and their estimated levels are uncertain. If the posterior of the
-    position is almost as wide as these levels allow, or the scale is not determined, the estimated position
-    is a random draw from the levels, and no nearer to the truth than the logged one.
-    """
-    _, distance = _residuals(system.problem, state.position)
-    range_m = float(np.nanmedian(distance))
-    poses = system.knowledge.poses
-    slow_m = float(np.mean([_ray_sigma_m(replace(errors, white=(0.0, 0.0)), range_m) for errors in poses]))
-    white_m = float(np.mean([_ray_sigma_m(replace(errors, processes=()), range_m) for errors in poses]))
-    if slow_m <= white_m:
-        return False
-    left_m = float(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean()))
-    unseen = _scale_left(system, state, at) > _UNSEEN_SCALE
-    return unseen or left_m > _DETERMINED_PLACE * slow_m * _spread_of(len(poses))
 
 
 def _scale_unseen(system: System, state: State, at: Eliminated) -> bool:
