@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.gait import GaitEvents, gait_events, summary
+from pipelines.geometry.gait import GaitEvents, _low_pass, gait_events, summary
 
 JOINTS = ("left_hip", "right_hip", "left_ankle", "right_ankle")
 RATE_HZ, SPEED_MPS, SWING_M, STRIDE_S = 30.0, 1.3, 0.35, 1.1
@@ -83,3 +83,14 @@ def test_no_step_reaches_over_a_gap() -> None:
 def test_who_is_never_seen_has_no_gait() -> None:
     t_ns, position = walk()
     assert gait_events(JOINTS, t_ns, np.full_like(position, np.nan)) is None
+
+
+@pytest.mark.parametrize("cutoff_hz", [6.0, 2.0])
+def test_the_filter_is_scipys_in_both_directions(cutoff_hz: float) -> None:
+    from scipy.signal import butter, sosfiltfilt
+
+    values = np.random.default_rng(0).normal(0.0, 1.0, (300, 2))
+    expected = sosfiltfilt(butter(2, cutoff_hz, fs=RATE_HZ, output="sos"), values, axis=0)
+    # What made-up samples before the first one do has decayed to e^-30 within 100 steps.
+    found = _low_pass(values, cutoff_hz, RATE_HZ)
+    np.testing.assert_allclose(found[100:-100], expected[100:-100], atol=1e-9)

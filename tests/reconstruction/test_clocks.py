@@ -29,12 +29,15 @@ def test_a_clock_is_known_where_the_person_moves_and_unknown_where_nothing_does(
     assert walking.clock_sigma_s[1] < 0.003
     assert abs(walking.clock_offset_s[1] - 0.02) < 3 * walking.clock_sigma_s[1]
 
-    rng = np.random.default_rng(0)
-    frozen = [
-        replace(s, rays=s.rays[:1] + rng.normal(0, 2 / FOCAL_PX, s.rays.shape)) for s in flight.sightings
-    ]
-    standing = refined(frozen, flight.t_s, np.repeat(flight.start[:1], 45, axis=0))
-    assert standing.clock_sigma_s[1] > 0.5 * PRIOR_S
+    sigmas_s = []
+    for seed in range(3):  # noise of one draw may pass for motion
+        rng = np.random.default_rng(seed)
+        frozen = [
+            replace(s, rays=s.rays[:1] + rng.normal(0, 2 / FOCAL_PX, s.rays.shape)) for s in flight.sightings
+        ]
+        standing = refined(frozen, flight.t_s, np.repeat(flight.start[:1], 45, axis=0))
+        sigmas_s.append(standing.clock_sigma_s[1])
+    assert np.median(sigmas_s) > 0.5 * PRIOR_S
 
 
 TIMES, LATE_S, SIGMA_S = 150, 0.45, 0.5
