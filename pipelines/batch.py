@@ -62,16 +62,10 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Result of a flight."""
+class Outcome(FlightRow):
+    """Result of a flight, whose paths are written as seen from the summary once it is back."""
 
-    failed_stage: str | None = None
-    error: str | None = None  # one line
     unchanged: bool = False  # no stage had anything to do
-    name: str | None = None
-    figures: dict[str, float] = field(default_factory=dict)  # by column of the summary
-    warnings: tuple[str, ...] = ()
-    doubt: str | None = None  # code of the doubt that explains the most
     reported: bool = False  # the session has a report, perhaps of an earlier run
     started: bool = False  # at least one stage was run, or tried
 
@@ -278,18 +272,9 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
 
 
 def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
-    page = job.session / "report" / "index.html"
-    report = _from(folder, page) if outcome.reported else None
-    return FlightRow(
-        flight=_from(folder, job.flight),
-        name=outcome.name,
-        failed_stage=outcome.failed_stage,
-        error=None if outcome.error is None else _as_here(outcome.error),
-        figures=outcome.figures,
-        warnings=outcome.warnings,
-        report=report,
-        doubt=outcome.doubt,
-    )
+    report = _from(folder, job.session / "report" / "index.html") if outcome.reported else None
+    error = None if outcome.error is None else _as_here(outcome.error)
+    return replace(outcome, flight=_from(folder, job.flight), error=error, report=report)
 
 
 def _as_here(line: str) -> str:

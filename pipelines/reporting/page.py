@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -253,13 +253,13 @@ _TILT = "tilt_deg_"
 class FlightRow:
     """One flight."""
 
-    flight: str  # its manifest, as seen from the summary
-    name: str | None  # its own name; None if it was not ingested
-    failed_stage: str | None
-    error: str | None  # one line; None if all went well
-    figures: dict[str, float]  # by column, without figures that were not measured
-    warnings: tuple[str, ...]
-    report: str | None  # path of its page, as seen from the summary
+    flight: str = ""  # its manifest, as seen from the summary
+    name: str | None = None  # its own name; None if it was not ingested
+    failed_stage: str | None = None
+    error: str | None = None  # one line; None if all went well
+    figures: dict[str, float] = field(default_factory=dict)  # by column, without those not measured
+    warnings: tuple[str, ...] = ()
+    report: str | None = None  # path of its page, as seen from the summary
     doubt: str | None = None  # code of the doubt that explains the most
 
     @property
