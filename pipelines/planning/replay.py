@@ -88,16 +88,6 @@ class Replay(ArmFlight):
         seconds: Float = (self.t_ns - self.t_ns[0]) / 1e9
         return seconds
 
-    @property
-    def tilt_rad(self) -> Float:
-        """Tilt [N, T] as flown, above the logged actor."""
-        return slot_of(self.position - self.actor)[..., TILT]
-
-    @property
-    def formation_yaw_rad(self) -> Float:
-        """Yaw [T] of the first camera's slot, continuous."""
-        return self.slots[0, :, YAW]
-
 
 class Pilot:
     """One arm in flight. Call `measure` at each measurement and `replan` at the tracking rate."""

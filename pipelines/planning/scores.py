@@ -278,15 +278,6 @@ def _has_obstacles(maps: DistanceField | MapsInTurn) -> bool:
     return any(field.has_obstacles for field in fields)
 
 
-def predicted_errors(
-    position: Float, actor: Float, maps: DistanceField | MapsInTurn, config: PlannerConfig
-) -> Float:
-    """Compute sqrt(tr S) [T] in metres of the free views, inf where they do not determine a point."""
-    seen = seen_actor(position, actor, maps, config)
-    error: Float = errors_of_views(position, actor[None], seen[None], config)[0]
-    return error
-
-
 def errors_of_views(position: Float, people: Float, seen: Bool, config: PlannerConfig) -> Float:
     """Compute sqrt(tr S) [P, T] in metres of people [P, T, 3] whom cameras [N, T, 3] see [P, N, T]."""
     return predicted_error(

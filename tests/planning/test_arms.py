@@ -16,7 +16,7 @@ from pipelines.planning.arms import ADAPTIVE, FIXED, GROUP, JOINT, Arm, RollingO
 from pipelines.planning.config import SETTINGS, Imperfections, PlannerConfig, planner_config
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.forecast import ActorFilter, Forecast
-from pipelines.planning.formation import FormationPath, costs_of_slots, formation_slots, slot_offsets
+from pipelines.planning.formation import FormationPath, costs_of_slots, formation_slots, slot_of, slot_offsets
 from pipelines.planning.imperfections import aimed
 from pipelines.planning.local import (
     ACCELERATION,
@@ -267,7 +267,7 @@ def fly(
 
 
 def tilt_deg(result: Replay) -> Float:
-    return np.degrees(result.tilt_rad)
+    return np.degrees(slot_of(result.position - result.actor)[..., 1])
 
 
 def test_the_adaptive_formation_goes_round_the_mound_and_the_fixed_one_over_it() -> None:
@@ -276,8 +276,8 @@ def test_the_adaptive_formation_goes_round_the_mound_and_the_fixed_one_over_it()
     fixed, adaptive = fly(FIXED, field), fly(ADAPTIVE, field)
     assert tilt_deg(fixed).max(axis=1).min() > 30
     assert tilt_deg(adaptive).max() < 20
-    assert np.ptp(fixed.formation_yaw_rad) == 0
-    assert np.abs(np.degrees(adaptive.formation_yaw_rad[-1]) - 45) > 80
+    assert np.ptp(fixed.slots[0, :, 0]) == 0
+    assert np.abs(np.degrees(adaptive.slots[0, -1, 0]) - 45) > 80
     assert tilt_deg(fixed).mean() - tilt_deg(adaptive).mean() > 5
     for result in (fixed, adaptive):
         assert field.sample(result.position)[0].min() > 1
@@ -291,7 +291,7 @@ def test_over_bare_ground_and_in_the_open_nothing_turns_or_climbs(
 ) -> None:
     result = fly(arm, world(), seconds=12.0, yaw_deg=yaw_deg)
     assert np.abs(tilt_deg(result) - CONFIG.tilt_deg).max() < 3
-    assert np.degrees(result.formation_yaw_rad) == pytest.approx(np.full(len(result.t_ns), yaw_deg))
+    assert np.degrees(result.slots[0, :, 0]) == pytest.approx(np.full(len(result.t_ns), yaw_deg))
 
 
 @pytest.mark.parametrize("arm", [ADAPTIVE, JOINT], ids=lambda arm: arm.name)
@@ -315,8 +315,8 @@ def test_nothing_is_seen_before_its_time() -> None:
     before = plain.t_s < 6.0 - 1e-9
     assert np.array_equal(plain.position[:, before], changed.position[:, before])
     assert not np.allclose(plain.position[:, -1], changed.position[:, -1], atol=0.5)
-    assert np.ptp(changed.formation_yaw_rad[before]) == 0
-    assert np.ptp(changed.formation_yaw_rad) > 0
+    assert np.ptp(changed.slots[0, before, 0]) == 0
+    assert np.ptp(changed.slots[0, :, 0]) > 0
 
 
 def flown_with(seed: int = 0, **imperfections: Any) -> Replay:

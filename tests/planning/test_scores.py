@@ -27,7 +27,7 @@ from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field, open_space, visible
 from pipelines.planning.formation import formation_slots, slot_offsets
 from pipelines.planning.replay import CameraPaths, MeasuredJoints, measure
-from pipelines.planning.scores import predicted_errors, propulsion_w, score
+from pipelines.planning.scores import propulsion_w, score
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import wall
 
@@ -64,7 +64,6 @@ def test_a_still_formation_in_the_open() -> None:
     s2 = (keypoint_m**2 + (10 * np.radians(1.0)) ** 2 + 0.3**2) / placed
     error = np.sqrt(s2 * (0.5 + 2 / (1 - 1 / 16)))
     assert figures["predicted_error_m"] == pytest.approx({"median": error, "p95": error})
-    assert predicted_errors(position, actor, open_space(), CONFIG) == pytest.approx(np.full(len(T_S), error))
 
 
 def test_the_energy_of_hovering_turning_and_climbing() -> None:

@@ -17,9 +17,9 @@ from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field
-from pipelines.planning.formation import formation_slots, slot_offsets
+from pipelines.planning.formation import TILT, formation_slots, slot_of, slot_offsets
 from pipelines.planning.replay import Start, replay
-from pipelines.planning.scores import predicted_errors, score
+from pipelines.planning.scores import errors_of_views, score, seen_actor
 from pipelines.session.records import Occupancy
 
 Int64 = NDArray[np.int64]
@@ -254,10 +254,11 @@ def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
         place = _finely(result.position)
         slots_now = world.actor[0] + (result.position[:, 0] - result.actor[0])
         figures = score(result.t_s, result.position, result.actor, field, _CONFIG)
-        error = np.minimum(predicted_errors(result.position, result.actor, field, _CONFIG), _MOST_ERROR_M)
+        seen = seen_actor(result.position, result.actor, field, _CONFIG)[None]
+        error = errors_of_views(result.position, result.actor[None], seen, _CONFIG).clip(0, _MOST_ERROR_M)
         broken = figures["limit_violations"]
         assert isinstance(broken, dict)
-        away = np.linalg.norm(result.position - result.actor, axis=-1)
+        away_m, tilt_rad = slot_of(result.position - result.actor)[..., [2, TILT]].T
         rows.append(
             {
                 "seed": seed,
@@ -267,10 +268,10 @@ def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
                 "clearance_m": float(world.distance(place).min()),
                 "first_m": float(world.distance(slots_now).min()),
                 "ground_m": float((place[..., 2] - world.ground.height(place[..., 0], place[..., 1])).min()),
-                "actor_m": float(away.min()),
-                "farthest_m": float(away[:, -1].max()),
+                "actor_m": float(away_m.min()),
+                "farthest_m": float(away_m[-1].max()),
                 "limits": sum(broken[key] for key in ("speed", "acceleration", "jerk", "separation")),
-                "tilt_deg": float(np.degrees(result.tilt_rad).mean()),
+                "tilt_deg": float(np.degrees(tilt_rad).mean()),
                 "hidden": figures["occluded_share"],
                 "error_m": float(error.mean()),
                 "safety": getattr(result, "safety", {}),
