@@ -117,9 +117,9 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate every joint-frame by a method of the module.
 
-    `gate` counts standard deviations of a view's image point, pixel and pose noise together. Covariances are
-    NaN without `with_covariance`, which saves a third of the time. Statuses besides "ok": `not_detected` by
-    any camera; `few_views`: detected by only one; `no_pose`: fewer of the detections have one;
+    `gate` counts standard deviations of a view's image point, pixel and pose noise together. Covariances and
+    reprojections are NaN without `with_covariance`, which saves time. Statuses besides "ok": `not_detected`
+    by any camera; `few_views`: detected by only one; `no_pose`: fewer of the detections have one;
     `low_parallax`: no two lines differ by `MIN_PARALLAX_DEG`; `rejected`: fewer views agree within `gate`
     (`robust`), or the point is behind a camera (`dlt`, `midpoint`, which reject no view).
     """
@@ -200,7 +200,8 @@ def _triangulate_block(
     if with_covariance:
         covariance[ok] = _covariance(method, place, rotation, length2, weight, noise, inlier)[ok]
     points = np.where(ok[:, None], point + poses.middle[at], np.nan)
-    return points, inlier, status, covariance, inlier.sum(axis=1), reprojection_px(views, points)
+    off_px = reprojection_px(views, points) if with_covariance else np.full(seen.shape, np.nan)
+    return points, inlier, status, covariance, inlier.sum(axis=1), off_px
 
 
 def _linear_points(rotation: Float, centre: Float, along: Float, seen: Bool) -> Float:
@@ -231,7 +232,8 @@ def _midpoints(direction: Float, centre: Float, weight: Float, wanted: Bool) -> 
 def _closed(normal: Float) -> Float:
     """Add a little information to normal matrices [N, 3, 3] of less than full rank."""
     trace = np.maximum(np.trace(normal, axis1=1, axis2=2), np.finfo(float).tiny ** 0.5)
-    is_open = np.linalg.det(normal / trace[:, None, None]) <= 3.0 * np.finfo(float).eps
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(normal / trace[:, None, None], 0, -1)
+    is_open = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) <= 3.0 * np.finfo(float).eps
     more = np.where(is_open, _LEAST_INFORMATION * trace, 0.0)[:, None, None] * np.eye(3)
     return np.asarray(normal + more)
 

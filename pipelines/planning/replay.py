@@ -638,14 +638,15 @@ class _Smoother:
         across, square_m2 = _across_ray(paths.position[:, :, None] - joints)
         own = across / (self._pixel[..., None] * square_m2)[..., None, None]
         self._information = np.moveaxis(own, 0, -1).reshape(*joints.shape[:2], 9, -1).copy()  # [T, J, 9, N]
+        self._away = joints - paths.position[:, :, None]
+        self._axes = np.moveaxis(matrix_from_quaternion(paths.quaternion_xyzw), -1, 0)[..., None, :]
 
     def passed(self, rays: Float, seen: Bool) -> Float:
         """Compute by how much (m) rays [T, J, N, 2] pass joints that are seen [T, J, N]: means [T, N, 3]."""
-        rotation = matrix_from_quaternion(self._paths.quaternion_xyzw)
-        along = np.append(rays, np.ones_like(rays[..., :1]), axis=-1).transpose(2, 0, 1, 3) @ rotation.mT
-        along /= np.linalg.norm(along, axis=-1, keepdims=True)
-        away = self._joints - self._paths.position[:, :, None]
-        past = along * (along * away).sum(axis=-1, keepdims=True) - away
+        x, y = rays.transpose(3, 2, 0, 1)[..., None]
+        along = self._axes[0] * x + self._axes[1] * y + self._axes[2]
+        depth = np.einsum("ntja,ntja->ntj", along, self._away) / np.einsum("ntja,ntja->ntj", along, along)
+        past = along * depth[..., None] - self._away
         where = seen.transpose(2, 0, 1)
         total = np.where(where[..., None], past, 0.0).sum(axis=2)
         count = where.sum(axis=2)[..., None]

@@ -263,11 +263,11 @@ def detect_keypoints(
 
 def _correlated(shape: tuple[int, ...], kept: float, rng: np.random.Generator) -> Float:
     """Draw unit normal errors [T, J, 2], each joint's correlated with those of the frame before."""
+    from scipy.signal import lfilter
+
     error = rng.standard_normal((*shape, 2))
     error[1:] *= np.sqrt(1 - kept**2)
-    for k in range(1, len(error)):
-        error[k] += kept * error[k - 1]
-    return error
+    return np.asarray(lfilter([1.0], [1.0, -kept], error, axis=0))
 
 
 def _tails(tilt_deg: Float, joints: tuple[str, ...], rng: np.random.Generator) -> Float:
@@ -303,6 +303,8 @@ def _limb(joints: tuple[str, ...], parts: tuple[str, ...]) -> Bool:
 
 def _exchanged(values: Float, swapped: Bool, joints: tuple[str, ...]) -> Float:
     """Return values [T, J, ...] with every swapped joint's taken from its mirror."""
+    if not swapped.any():
+        return values
     mirror = [
         joints.index(mirrored(name)) if mirrored(name) in joints else j for j, name in enumerate(joints)
     ]
