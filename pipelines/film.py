@@ -3,11 +3,12 @@
 The scenario's world is built again, and what every camera would have seen is rendered, detected,
 reconstructed as `auto` does it in several draws of the poses' noise, and measured against the truth, which
 also says whom a detection shows. Where the films and the modelled measurement disagree, the films decide.
+The model also measures with the film's keypoints, which tells its detector's part in that from the rest.
 `replan` is only read.
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -64,7 +65,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=16)
+FILM = Stage("film", revision=17)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -196,11 +197,26 @@ def film(
             ]
             points = np.stack([own for own, _, _ in measured], axis=1)
             errors[name] = joined([of_draws for _, of_draws, _ in measured])
-            modelled[name] = _modelled(arm, fields, settings, seed=seed)
+            joints, usual = arm.people[0].person.joints, filmed_errors(settings.detector)
+            by_model = partial(detect_by_model, joints=joints, errors=usual, rate_hz=settings.rate_hz)
+            modelled[name] = _modelled(arm, fields, [by_model] * len(arm.people), seed=seed)
+            as_filmed = [partial(_detect_as_filmed, arm, seen) for seen in sightings]
+            by_keypoints = _modelled(arm, fields, as_filmed, seed=seed).error_m
             each = [own for _, _, own in measured]
             by_person = dict(zip((who.name for who in setting.people), each, strict=True))
             metrics[name] = each[0] if len(each) == 1 else _means(each) | {"by_person": by_person}
-            _write_arm(run.folder / name, arm, points, parts)
+            out = run.folder / name
+            out.mkdir()
+            motion = JointMotion(arm.t_ns, joints, points)
+            write_table(out / "skeleton.parquet", motion_table(motion), TRUTH)
+            for camera, part in zip(arm.names, parts, strict=True):
+                shutil.copyfile(part / "pictures.mp4", out / f"{camera}.mp4")
+            np.savez(
+                out / "errors.npz",
+                filmed=errors[name].error_m,
+                modelled=modelled[name].error_m,
+                by_keypoints=by_keypoints,
+            )
         t_ns = next(iter(arms.values())).t_ns
         shared = common_frames({name: own.error_m for name, own in errors.items()})
         for name, own in errors.items():
@@ -486,8 +502,20 @@ def _measured(
     return points, MeasuredJoints(off_m, known), figures | {"fallback": doubt}
 
 
+def _detect_as_filmed(
+    arm: _Arm, sightings: SimulatedKeypoints, _pixels: Float, _free: Bool, camera: Float, *_: object
+) -> tuple[Float, Float]:
+    """Return what was detected in the film of the camera at `camera` [T, 3] m (`replay.Detect`)."""
+    which = [np.array_equal(path, camera) for path in arm.seen_by.position].index(True)
+    return sightings.xy[which], sightings.confidence[which]
+
+
 def _modelled(
-    arm: _Arm, fields: Sequence[DistanceField], settings: FilmSettings, *, seed: int
+    arm: _Arm,
+    fields: Sequence[DistanceField],
+    detect: Sequence[Callable[..., tuple[Float, Float]]],
+    *,
+    seed: int,
 ) -> MeasuredJoints:
     """Measure an arm as `replan` models it, over the film's pictures and with the film's errors of poses."""
     count, middles = len(arm.names), [of.motion.root for of in arm.people]
@@ -506,11 +534,9 @@ def _modelled(
             person=p,
             others=np.stack(others) if others else None,
         )
-        errors = filmed_errors(settings.detector)
-        detect = partial(detect_by_model, joints=of.person.joints, errors=errors, rate_hz=settings.rate_hz)
         start_m = PlannerConfig().tuning.sight_start_m
         maps = in_turn(fields, arm.t_ns)
-        found.append(measure(paths, maps, detect, start_m=start_m, trials=DRAWS, seed=seed))
+        found.append(measure(paths, maps, detect[p], start_m=start_m, trials=DRAWS, seed=seed))
     return joined(found)
 
 
@@ -524,11 +550,3 @@ def _means(each: Sequence[dict[str, Any]]) -> dict[str, Any]:
         else:
             found[key] = _means(known) if isinstance(known[0], dict) else type(known[0])(np.mean(known))
     return found
-
-
-def _write_arm(folder: Path, arm: _Arm, points: Float, parts: Sequence[Path]) -> None:
-    folder.mkdir()
-    motion = JointMotion(arm.t_ns, arm.people[0].person.joints, points)
-    write_table(folder / "skeleton.parquet", motion_table(motion), TRUTH)
-    for name, part in zip(arm.names, parts, strict=True):
-        shutil.copyfile(part / "pictures.mp4", folder / f"{name}.mp4")

@@ -60,7 +60,7 @@ from pipelines.simulation.detector_errors import (
 )
 from pipelines.simulation.scenario import DetectorErrors
 
-REPLAN_STAGE = Stage("replan", revision=20)
+REPLAN_STAGE = Stage("replan", revision=21)
 
 _SKELETON = "reconstruct/skeleton.parquet"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -138,7 +138,9 @@ def replan(
         results = {arm: read_result(place) for arm, place in made.items()}
         keypoints = f"modelled after {errors.detector}"
         metrics = jsonable({"name": name} | compare(scene, results) | {"keypoints": keypoints})
-        write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
+        actor = pd.DataFrame({"t_ns": scene.t_ns, "person": 0})
+        actor[["x", "y", "z"]] = scene.actor
+        write_table(run.folder / "actor.parquet", actor, ACTOR)
         write_json(run.folder / "metrics.json", metrics)
         kept, lost = _keep_by_name(
             session, run.folder, name, {"settings": jsonable(stated), "inputs": inputs}
@@ -297,9 +299,3 @@ def read_result(folder: Path) -> ArmResult:
         flight=flight_from(table, np.load(folder / "aim.npy"), facts["safety"]),
         measured=MeasuredJoints(np.load(errors), facts["joint_frames"]) if errors.exists() else None,
     )
-
-
-def _actor_table(scene: ReplayScene) -> pd.DataFrame:
-    table = pd.DataFrame({"t_ns": scene.t_ns, "person": 0})
-    table[["x", "y", "z"]] = scene.actor
-    return table

@@ -48,12 +48,10 @@ def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
     assert filmed["in_view_share"] == filmed["detected_share"] == 1.0
     assert filmed["tilt_deg"]["mean"] == pytest.approx(15, abs=1)
     assert filmed["keypoint_pck"] > 0.9
-    assert filmed["reconstruction_error"]["mpjpe_mm"]["mean"] < FIRST_MM
-    assert filmed["mpjpe_mm"] < FIRST_MM
+    assert max(filmed["mpjpe_mm"], filmed["reconstruction_error"]["mpjpe_mm"]["mean"]) < FIRST_MM
     assert filmed["fallback"] is not None, "auto needs more than four moments"
     folder = session / "film" / "fixed"
     assert len(FORMAT.index(folder / "drone1.mp4").pts_ns) == 4
-    assert (folder / "skeleton.parquet").is_file()
 
     replanned = read_json(session / "replan" / "stage.json")
     again = compare(session, *SMALL)
@@ -140,3 +138,5 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
     assert figures["mpjpe_mm"] == pytest.approx((anna["mpjpe_mm"] + ben["mpjpe_mm"]) / 2)
     found = read_motion(session / "film" / "fixed" / "skeleton.parquet", TRUTH, truth.joints)
     np.testing.assert_allclose(found.position, joints[:3], atol=0.01)
+    with np.load(session / "film" / "fixed" / "errors.npz") as errors:
+        assert max(errors["filmed"].max(), errors["by_keypoints"].max()) < 0.001
