@@ -145,11 +145,7 @@ def chosen_flights(names: Sequence[str], detector: str) -> list[Flight]:
 
 
 def measured(
-    chosen: Sequence[Flight],
-    methods: Sequence[str],
-    detector: str,
-    draws: int,
-    processes: int,
+    chosen: Sequence[Flight], methods: Sequence[str], detector: str, draws: int, processes: int
 ) -> dict[Case, Outcome]:
     """Measure every flight, draw and method; what is kept of earlier runs of the same code is taken."""
     work = [

@@ -31,12 +31,7 @@ from benchmarks.corpus.stored import flights, read_backgrounds, read_keypoints
 from benchmarks.results import markdown_table, parser_of, show
 from pipelines.geometry.arrays import Int64, Intrinsics
 from pipelines.geometry.noise import Bias, GaussMarkov, NoiseModel, White, disturb, pose_errors
-from pipelines.geometry.poses import (
-    conjugate,
-    interpolate_poses,
-    multiply,
-    rotation_vector_from_quaternion,
-)
+from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rotation_vector_from_quaternion
 from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.reconstruction.background_tracks import Tracks

@@ -47,10 +47,7 @@ CASES: dict[str, tuple[str, Poses, str]] = {
     "heavy, true poses": ("blazepose-heavy", "true", "auto"),
 }
 TRUE_SHAPE = "heavy, true shape"
-ONE_CAMERA: dict[str, Poses] = {
-    "one camera": "logged",
-    "one camera, true poses": "true",
-}
+ONE_CAMERA: dict[str, Poses] = {"one camera": "logged", "one camera, true poses": "true"}
 _HELD = 1e6  # precision of a shape that is held
 _TIMES = 25  # at which surfaces are compared
 _VERTICES = 200
