@@ -377,9 +377,7 @@ def angles_table(chosen: Sequence[Flight], found: Mapping[Case, Outcome]) -> lis
         own = [flight for flight in chosen if flight.half == half]
         for method in ("auto", FLOOR) if own else ():
             each = [_of(flight, method, "model", found) for flight in own]
-            medians = [
-                np.nanmedian([_mean(outcomes, f"{name}_deg") for outcomes in each]) for name in FLEXIONS
-            ]
+            medians = [np.nanmedian([_mean(of, f"{name}_deg") for of in each]) for name in FLEXIONS]
             rows.append([half, _NAMES.get(method, method), *(fixed(float(value), 1) for value in medians)])
     return markdown_table(["half", "method", "hip flexion RMSE deg", "knee flexion", "elbow flexion"], rows)
 
@@ -406,9 +404,7 @@ SUBJECTS: dict[str, tuple[Any, Any]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     commands = parser.add_subparsers(dest="subject", required=True)
     for name, (add, _) in SUBJECTS.items():
         command = commands.add_parser(name)

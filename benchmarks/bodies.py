@@ -144,10 +144,8 @@ def errors_of(session: Path) -> Iterator[BodyErrors]:
     place = session / "reconstruct"
     if not (place / "body.parquet").is_file():
         return
-    table, skeleton = (
-        read_table(place / "body.parquet", BODY),
-        read_motion(place / "skeleton.parquet", SKELETON),
-    )
+    table = read_table(place / "body.parquet", BODY)
+    skeleton = read_motion(place / "skeleton.parquet", SKELETON)
     shapes = read_table(place / "body_shape.parquet", BODY_SHAPE)
     truth = load_bodies(session / "truth_body.parquet", session / "truth_body_shape.parquet")
     for body in load_bodies(place / "body.parquet", place / "body_shape.parquet"):

@@ -37,9 +37,8 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
     rows = []
     with tempfile.TemporaryDirectory(prefix="detectors-") as folder:
         sample = ingest(SAMPLE / "true_poses.yaml", Path(folder) / "sample.session").folder
-        real = (
-            ingest(real_flight(Path(folder)), Path(folder) / "real.session").folder if REAL.is_dir() else None
-        )
+        place = Path(folder)
+        real = ingest(real_flight(place), place / "real.session").folder if REAL.is_dir() else None
         for detector in options.detectors:
             settings = ReconstructSettings(method="robust", detector=detector)
             found = reconstruct(sample, settings).metrics

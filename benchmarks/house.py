@@ -297,9 +297,7 @@ def rows_of(options: argparse.Namespace) -> Iterator[Row]:
     yield Row("benchmarks, lines", lines, 4_000, "", largest(benchmarks))
     commands = tuple(m.place for m in benchmarks if "if __name__ ==" in m.text)
     yield Row("benchmarks, commands", len(commands), 8, "", commands)
-    importing = [
-        m.place for m in tests if re.search(r"^\s*(from|import) benchmarks", m.text, flags=re.MULTILINE)
-    ]
+    importing = [m.place for m in tests if re.search(r"(?m)^\s*(from|import) benchmarks", m.text)]
     yield Row("tests that import benchmarks", len(importing), 0, "", tuple(importing))
 
     lines = sum(module.lines for module in tests)
@@ -354,9 +352,7 @@ def rows_of(options: argparse.Namespace) -> Iterator[Row]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the house.", epilog=CONSTANTS_ARE)
-    parser.add_argument(
-        "--worst", nargs="?", const="", metavar="PART", help="Name offenders [in PART of paths]."
-    )
+    parser.add_argument("--worst", nargs="?", const="", metavar="PART", help="Name offenders [of PART].")
     parser.add_argument("--session", type=Path, default=SAMPLE, help="Session with the sample's metrics.")
     parser.add_argument("--times", type=Path, default=TIMES, help="JUnit file of `make test`.")
     options = parser.parse_args()

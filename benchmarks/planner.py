@@ -22,14 +22,15 @@ import csv
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.flights import REAL_DATA, scenario_of, walker
 from benchmarks.results import fixed, markdown_table, parser_of, show
@@ -69,27 +70,21 @@ def worlds(options: argparse.Namespace) -> Lines:
     seeds = range(options.first or 0, (options.first or 0) + (options.count or 300))
     rows = list(flown(seeds, options.workers, ARMS))
     table, trouble = [], []
-    for arm in ARMS:
-        own = [row for row in rows if row["arm"] == arm]
-        table.append(
-            [
-                *(arm, str(len(own)), str(sum(row["clearance_m"] <= 0 for row in own))),
-                *(fixed(min(row[key] for row in own), 2) for key in ("clearance_m", "actor_m")),
-                str(sum(row["limits"] > 0 for row in own)),
-                fixed(float(np.mean([row["tilt_deg"] for row in own])), 1),
-                fixed(100 * float(np.mean([row["hidden"] for row in own])), 2),
-                fixed(1e3 * float(np.mean([row["error_m"] for row in own])), 1),
-            ]
-        )
+    for arm, own in pd.DataFrame(rows).groupby("arm", sort=False):
+        near = [fixed(own[key].min(), 2) for key in ("clearance_m", "actor_m")]
+        touched, broken = (own["clearance_m"] <= 0).sum(), (own["limits"] > 0).sum()
+        tilt_deg, hidden, error_m = own[["tilt_deg", "hidden", "error_m"]].mean()
+        mean = [f"{tilt_deg:.1f}", f"{100 * hidden:.2f}", f"{1e3 * error_m:.1f}"]
+        table.append([str(arm), str(len(own)), str(touched), *near, str(broken), *mean])
     for row in rows:
-        broken = {
+        bad = {
             "touches something": row["clearance_m"] <= 0,
             "is below the ground": row["ground_m"] <= 0,
             "breaks limits": row["limits"],
             "is too near to the actor": row["actor_m"] < _CONFIG.actor_distance_m,
         }
         world = f"world {row['seed']} ({row['kind']}), {row['arm']}"
-        trouble += [f"FAIL: {world}: a drone {what}" for what, true in broken.items() if true]
+        trouble += [f"FAIL: {world}: a drone {what}" for what, true in bad.items() if true]
     header = ["arm", "flights", "touched", "nearest m", "nearest actor m", "limits broken"]
     lines = markdown_table([*header, "tilt deg", "hidden %", "predicted mm"], table)
     if trouble:
@@ -123,26 +118,19 @@ class FilmedScene:
 def scene_of(folder: Path, name: str) -> FilmedScene:
     """Read a scene."""
     document = json.loads((folder / name / f"{name}_data.json").read_text(encoding="utf-8"))
-    rows = np.array(
-        [
-            [[*each["location"][:2], each["rotation"][2], each["weight"]] for each in row]
-            for row in document["actor_positions"]
-        ]
-    )
-    scale = document["scene"]["scale"]
+    steps, scale = document["actor_positions"], document["scene"]["scale"]
+    rows = np.array([[[*p["location"][:2], p["rotation"][2], p["weight"]] for p in row] for row in steps])
     people = np.concatenate([rows[..., :2], np.zeros_like(rows[..., :1])], axis=-1)
-    return FilmedScene(
-        people, rows[..., 2], rows[..., 3], (int(scale["x"]), int(scale["y"])), SCORED_RAD[name]
-    )
+    cells = int(scale["x"]), int(scale["y"])
+    return FilmedScene(people, rows[..., 2], rows[..., 3], cells, SCORED_RAD[name])
 
 
 def solution_of(folder: Path, name: str, planner: str) -> Float:
     """Read a planner's solution: x, y (m) and the number of the heading, [N, T, 3]."""
     document = json.loads((folder / name / planner / "solution.json").read_text(encoding="utf-8"))
     states = [[each["state"] for each in path] for _, path in document["elements"]]
-    return np.array(
-        [[[s["x"], s["y"], HEADINGS.index(s["heading"])] for s in path] for path in states], float
-    )
+    places = [[[s["x"], s["y"], HEADINGS.index(s["heading"])] for s in path] for path in states]
+    return np.array(places, float)
 
 
 def covered(scene: FilmedScene, states: Float, k: int) -> Float:
@@ -154,10 +142,8 @@ def covered(scene: FilmedScene, states: Float, k: int) -> Float:
 
 def quality(scene: FilmedScene, paths: Float) -> Float:
     """Compute the view quality [T] of paths [N, T, 3]."""
-    steps = range(len(scene.people))
-    return np.array(
-        [view_quality(covered(scene, paths[:, k], k).sum(axis=0), scene.weight[k]) for k in steps]
-    )
+    seen = [covered(scene, paths[:, k], k).sum(axis=0) for k in range(len(scene.people))]
+    return np.array([view_quality(*one) for one in zip(seen, scene.weight, strict=True)])
 
 
 def planned(scene: FilmedScene, starts: Float) -> Float:
@@ -168,10 +154,7 @@ def planned(scene: FilmedScene, starts: Float) -> Float:
     steps = len(scene.people) - 1
     seen = np.stack([covered(scene, cells, k + 1) for k in range(steps)])
     slots = SlotChoice(grid, grid.states[0], np.zeros((steps, len(cells))), cells[None], seen)
-    choices = [
-        [slots._replace(start=np.array([heading * np.pi / 4, east, north]))]
-        for east, north, heading in starts
-    ]
+    choices = [[slots._replace(start=start)] for start in starts[:, [2, 0, 1]] * [np.pi / 4, 1.0, 1.0]]
     paths = plan_in_turn(choices, Worth(scene.weight[0], 1.0))
     return np.stack([np.vstack([start, cells[path]]) for start, (_, path) in zip(starts, paths, strict=True)])
 
@@ -243,33 +226,23 @@ def compared(people: dict[str, dict[str, Any]], seed: int, arms: tuple[str, ...]
 
 def groups(options: argparse.Namespace) -> Lines:
     """Compare arms where people walk apart; means over flights."""
-    seeds = options.seeds or [10, 11, 12, 13, 14, 15]
     rows = []
-    for number in (2, 3):
-        people = splitting(number)
-        for name, arms, alone in (
-            ("", ("group", "adaptive", "joint"), False),
-            ("first", ("adaptive",), True),
-        ):
-            found = [compared(people, seed, arms, alone=alone)["arms"] for seed in seeds]
-            for arm in arms:
-                own = [row[arm] for row in found]
-                errors = [row["reconstruction_error"] for row in own]
-                by_person = [list(row["by_person"].values()) for row in own]
-                each = np.mean([[one["pck150"]["mean"] for one in row] for row in by_person], axis=0)
-                right, measured = (
-                    100 * np.mean([error[key]["mean"] for error in errors]) for key in ("pck150", "coverage")
-                )
-                view = np.mean([[one["view_quality"] for one in row] for row in by_person])
-                rows.append(
-                    [
-                        *(str(number), name or arm, f"{right:.1f}"),
-                        " ".join(f"{100 * share:.0f}" for share in each),
-                        *(f"{measured:.1f}", f"{view:.3f}"),
-                        f"{np.mean([row['blind_s'] for row in own]):.1f}",
-                        str(sum(sum(row["limit_violations"].values()) for row in own)),
-                    ]
-                )
+    cases = (("", ("group", "adaptive", "joint"), False), ("first", ("adaptive",), True))
+    for number, (name, arms, alone) in product((2, 3), cases):
+        seeds, people = options.seeds or range(10, 16), splitting(number)
+        found = [compared(people, seed, arms, alone=alone)["arms"] for seed in seeds]
+        for arm in arms:
+            own = [row[arm] for row in found]
+            by_person = [list(row["by_person"].values()) for row in own]
+            each = np.mean([[one["pck150"]["mean"] for one in row] for row in by_person], axis=0)
+            errors = [row["reconstruction_error"] for row in own]
+            right, measured = (np.mean([of[key]["mean"] for of in errors]) for key in ("pck150", "coverage"))
+            view = np.mean([[one["view_quality"] for one in row] for row in by_person])
+            blind_s = np.mean([one["blind_s"] for one in own])
+            broken = sum(sum(one["limit_violations"].values()) for one in own)
+            shares = " ".join(f"{100 * one:.0f}" for one in each)
+            row = [str(number), name or arm, f"{100 * right:.1f}", shares, f"{100 * measured:.1f}"]
+            rows.append([*row, f"{view:.3f}", f"{blind_s:.1f}", str(broken)])
     header = ["people", "arm", "within 150 mm %", "of each", "measured %", "view quality", "blind s"]
     return markdown_table([*header, "limits violated"], rows)
 
@@ -330,7 +303,7 @@ def films(options: argparse.Namespace) -> Lines:
         both = [f"{arm['range_m']['mean']:.1f} m, {arm['tilt_deg']['mean']:.0f} deg" for arm in arms.values()]
         mean = np.mean(rows[-1], axis=2).T.ravel()
         table.append([str(seed), *both, *(fixed(value, 1) for value in mean)])
-    header = [f"{of}, {figure}" for figure in FIGURES for of in KINDS]
+    header = [f"{of.replace('_', ' ')}, {figure}" for figure in FIGURES for of in KINDS]
     lines = markdown_table(["world", *arms, *header], table)
     return [*lines, "", *calibration(np.array(rows))]
 
@@ -338,9 +311,7 @@ def films(options: argparse.Namespace) -> Lines:
 def differences(one: Float, other: Float) -> Float:
     """Compute errors [draws, T, J] m less others in each draw, [3, draws]: the `FIGURES`."""
     shared = np.isfinite(one + other)
-    mean = [
-        1e3 * np.where(shared, own, 0.0).sum(axis=(1, 2)) / shared.sum(axis=(1, 2)) for own in (one, other)
-    ]
+    mean = [1e3 * np.where(shared, of, 0.0).sum(axis=(1, 2)) / shared.sum(axis=(1, 2)) for of in (one, other)]
     capped = [1e3 * np.fmin(np.nan_to_num(own, nan=PCK_M), PCK_M).mean(axis=(1, 2)) for own in (one, other)]
     right = [100 * (own <= PCK_M).mean(axis=(1, 2)) for own in (one, other)]
     return np.stack([np.subtract(*both) for both in (mean, capped, right)])
@@ -357,16 +328,11 @@ def calibration(of: Float) -> Lines:
         off = np.sqrt(np.mean((mean[:2] - mean[2]) ** 2, axis=1))
         values = [*agree, most, *off, mean[2].std(), np.sqrt(noise)]
         rows.append([figure, *(fixed(value, 2 if i < 3 else 1) for i, value in enumerate(values))])
-    header = ["figure", "correlation", "by keypoints", "largest possible", "off by (RMS)", "by keypoints"]
+    header = ["figure", "correlation", "by keypoints", "of a perfect model", "off by (RMS)", "by keypoints"]
     return markdown_table([*header, "spread of filmed", "of one draw of keypoints"], rows)
 
 
-SUBJECTS: dict[str, tuple[Callable[[argparse.Namespace], Lines], str]] = {
-    "worlds": (worlds, "planner-worlds"),
-    "filming": (filming, "planner-filming"),
-    "films": (films, "planner-films"),
-    "groups": (groups, "planner-groups"),
-}
+SUBJECTS = {"worlds": worlds, "filming": filming, "films": films, "groups": groups}
 
 
 def main() -> None:
@@ -377,8 +343,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     options = parser.parse_args()
-    function, key = SUBJECTS[options.subject]
-    show(key, function(options), write=options.write)
+    show(f"planner-{options.subject}", SUBJECTS[options.subject](options), write=options.write)
 
 
 if __name__ == "__main__":

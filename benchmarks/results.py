@@ -107,7 +107,8 @@ SECTIONS = (
     Section(
         "Planner",
         "Flights are closed loops of point masses. Tilt is the elevation of cameras above the person."
-        " Errors are those of joints that all arms measured.",
+        " Errors are those of joints that all arms measured. Differences are of `adaptive` less the flight as"
+        " flown; by keypoints: of the model with what the detector found in the films.",
         (
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
             Part("planner-worlds", "Random worlds", MODELLED, ""),
@@ -333,9 +334,7 @@ MEASURES: dict[str, Callable[[], None]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--only", choices=MEASURES, help="measure one part")
     parser.add_argument("--page", action="store_true", help="write the page alone")
     parser.add_argument("--check", action="store_true", help="check that the page is up to date")

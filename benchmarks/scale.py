@@ -102,10 +102,7 @@ def accuracy(seed: int) -> Iterator[list[str]]:
             path = manifest.with_name(f"{stated}.yaml")
             path.write_text(yaml.safe_dump(document), encoding="utf-8")
             session = ingest(path, Path(folder) / f"{stated}.session").folder
-            found = [
-                reconstruct(session, ReconstructSettings(method=method)).metrics
-                for method in ("robust", "auto")
-            ]
+            found = [reconstruct(session, ReconstructSettings(method=m)).metrics for m in ("robust", "auto")]
             yield [
                 f"{seed}, {len(document['cameras'])} drones, {'drifting' if seed % 2 else 'constant'}",
                 "yes" if stated else "no",
