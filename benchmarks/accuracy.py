@@ -61,6 +61,7 @@ METHODS = ("robust", "refined", "auto")
 SPECIAL: dict[str, tuple[str, Any]] = {
     "background": ("reconstruction.background._MOST_UNBOUND", -1.0),
     "ground": ("reconstruction.ground._FEWEST_PATCHES", 10**9),
+    "rotation levels in the ground": ("reconstruction.ground._rotation_level", lambda *_: np.inf),
     "cameras that stand": ("reconstruction.background._FEWEST_STANDING", 10**9),
     "joints without slow errors": ("reconstruction.refinement.refine.REMEMBERED", np.inf),
     "faster motion": ("reconstruction.refinement.refine._FAST_MOTION", 1.0),

@@ -243,6 +243,7 @@ class Adjusted:
     left: PoseErrors | None  # errors that remain; None where refused
     modes: Float  # [T, 6, R] of the errors that remain (`ErrorModes`), but for a constant shift
     shift_m: float  # standard deviation of that shift
+    turn: Float  # [3] rad, mean rotation error that was taken off
     prior: PosePrior  # with levels as estimated
     points: int  # that were used
     reprojection_px: float  # median; NaN where there is no solution
@@ -297,8 +298,9 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
 
     def refused(reason: str, reprojection_px: float = np.nan) -> Adjusted:
         stays = prior.covariance(len(position))
-        modes, px = np.empty((len(position), 6, 0)), reprojection_px
-        return Adjusted(position, rotation, stays, None, modes, prior.constant[0], prior, 0, px, reason)
+        modes, (shift_m, *_), turn = np.empty((len(position), 6, 0)), prior.constant, np.zeros(3)
+        px = reprojection_px
+        return Adjusted(position, rotation, stays, None, modes, shift_m, turn, prior, 0, px, reason)
 
     if not len(posed):
         return refused("none of its pictures has a pose")
@@ -340,6 +342,7 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
         replace(left[len(left) // 2], assumed=prior.assumed),
         modes,
         float(np.hypot(prior.constant[0], results[len(results) // 2].place_m)),
+        errors[posed, 3:].mean(axis=0),
         results[len(results) // 2].prior,
         points,
         pixels,
@@ -1179,7 +1182,13 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:
         sigma=np.sqrt(variances.mean(axis=2)),
         covariance=covariance,
         errors=found.left,
-        modes=ErrorModes(t_ns[posed][::every], found.modes[posed][::every], found.shift_m),
+        modes=ErrorModes(
+            t_ns[posed][::every],
+            found.modes[posed][::every],
+            found.shift_m,
+            found.turn,
+            found.prior.constant[1],
+        ),
         loosened=_loosened_still(camera.loosened_at(t_ns[posed]), variances.mean(axis=2)),
     )
 
