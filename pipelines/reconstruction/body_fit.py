@@ -435,7 +435,7 @@ def _spread(slope: Float, by_shared: Float, covariance: Float, shared_covariance
     return np.asarray(own + _carried(by_shared, shared_covariance), np.float64)
 
 
-def shared_prior(landmarks: Landmarks) -> SharedPrior:
+def shared_prior(landmarks: Landmarks, both_sides: float = _ALIKE_ON_BOTH_SIDES) -> SharedPrior:
     """Return the prior of shape, offsets and level."""
     sigma, names = landmarks.body_sigma, landmarks.joints
     group = landmarks.bone[:, None] == landmarks.bone
@@ -445,7 +445,7 @@ def shared_prior(landmarks: Landmarks) -> SharedPrior:
     precision = np.eye(13 + 3 * len(sigma))
     precision[:12, :12] = np.diag(SHAPE_SIGMA**-2)
     mirror = np.array([[mirrored(one) == other != one for other in names] for one in names])
-    along = share + _ALIKE_ON_BOTH_SIDES * np.where(group, 0.0, share @ mirror)
+    along = share + both_sides * np.where(group, 0.0, share @ mirror)
     for axis, own in enumerate((share, share, along)):
         precision[12 + axis : -1 : 3, 12 + axis : -1 : 3] = np.linalg.inv(own * np.outer(sigma, sigma))
     return SharedPrior(np.concatenate([MEAN_SHAPE, np.zeros(3 * len(sigma) + 1)]), precision)
