@@ -64,6 +64,7 @@ SPECIAL: dict[str, tuple[str, Any]] = {
     "rotation levels in the ground": ("reconstruction.ground._rotation_level", lambda *_: np.inf),
     "cameras that stand": ("reconstruction.background._FEWEST_STANDING", 10**9),
     "joints without slow errors": ("reconstruction.refinement.refine.REMEMBERED", np.inf),
+    "levels of constant errors": ("reconstruction.refinement.refine._with_constant_levels", lambda *_: None),
     "faster motion": ("reconstruction.refinement.refine._FAST_MOTION", 1.0),
     "swaps over time": ("reconstruct._without_swaps", lambda cameras, _: (cameras, {})),
 }

@@ -13,6 +13,7 @@ from pipelines.geometry.noise import (
     SURVEYED_M,
     UNKNOWN_SIGMA,
     USUAL_CONSTANT,
+    USUAL_COUNT,
     PoseErrors,
     Process,
 )
@@ -57,6 +58,10 @@ SETTLED_S = 2e-3
 _UNEXPLAINED = 1.15
 # Right flights are not so many standard deviations from their prior.
 _SIGMAS = 4.0
+# Estimates under other levels converge in so many rounds.
+_SETTLING = 4
+# Levels of constant errors settle in so many rounds.
+_LEVEL_ROUNDS = 3
 # Constant errors have this share of the usual level where the pictures let the scene grow.
 _HELD = 0.1
 # Detectors place joints to 1 % of a person's height (simulation/data/blazepose_errors.csv). What varies of
@@ -414,7 +419,7 @@ def _priors(
 def _known_prior(
     problem: Problem, start: Float, prior: Sequence[PoseErrors], clock_sigma_s: Float
 ) -> Iterator[_Prior]:
-    """Yield priors with known pose errors: assumed constants of usual levels, or as logged."""
+    """Yield priors with known pose errors: assumed constants of estimated or usual levels, or as logged."""
     guess, _, disagreement_m, range_m = _first_guess(problem, start)
     unlearned = _unlearned(problem, start, tuple(prior), clock_sigma_s)
     state = initial_state(problem, unlearned, start)
@@ -429,15 +434,54 @@ def _known_prior(
     if not any(errors.assumed for errors in prior):
         yield _Prior(known, state, False, (), expected_m)
         return
-    # Usual levels of constant errors, or those guessed from the views if they are smaller.
-    usual = {kind: min(USUAL_CONSTANT[kind], sigma) for kind, sigma in guessed.items()}
-    usual_m = _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
+    usual, usual_m = _usual_levels(guessed), _ray_sigma_m(PoseErrors(USUAL_CONSTANT, ()), range_m)
+    found = _with_constant_levels(problem, known, state, guessed)
+    if found is not None:
+        yield _Prior(found, state, True, (), expected_m)
     if disagreement_m < _SIGMAS * usual_m:
         yield _Prior(_of_levels(known, usual), state, False, (), expected_m)
     held = _of_levels(known, {kind: _HELD * sigma for kind, sigma in usual.items()})
     # Errors are as large as usual, or as the views disagree if that is more.
     held_m = _spread_of(len(prior)) * max(usual_m, disagreement_m) / np.sqrt(3)
     yield _Prior(held, state, False, (), expected_m, held_m)
+
+
+def _usual_levels(guessed: Mapping[int, float]) -> dict[int, float]:
+    """Return usual levels of constant errors by kind, or those guessed from the views if they are smaller."""
+    return {kind: min(USUAL_CONSTANT[kind], sigma) for kind, sigma in guessed.items()}
+
+
+def _with_constant_levels(
+    problem: Problem, known: Knowledge, state: State, guessed: Mapping[int, float]
+) -> Knowledge | None:
+    """Estimate the level of assumed constant errors by MacKay's rule, pooled over the cameras.
+
+    A few numbers say little of a level: a usual level counts as `USUAL_COUNT` more. None exceeds the one that
+    the views' disagreement gives. None is returned where the scene would grow to fit the detector's errors.
+    """
+    for _ in range(_LEVEL_ROUNDS):
+        system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
+        variance = np.diagonal(shared_covariance(system, at))
+        del at  # factors of two estimates would be in memory together
+        found: dict[int, list[tuple[float, float]]] = {}
+        for (camera, process), (at_knots, column) in zip(
+            system.layout.processes, system.layout.place, strict=True
+        ):
+            if _is_assumed(known.poses[camera], process) and not at_knots:
+                kind = 1 if process.number == ROTATION else 0
+                own = slice(column, column + 3)
+                determined = float(np.sum(1 - variance[own] / process.sigma0**2))
+                found.setdefault(kind, []).append((float(np.sum(state.shared[own] ** 2)), determined))
+        level, usual = {}, _usual_levels(guessed)
+        for kind, parts in found.items():
+            squares, determined = np.sum(parts, axis=0)
+            usual2 = usual[kind] ** 2
+            level[kind] = np.sqrt((squares + USUAL_COUNT * usual2) / (max(determined, 0.0) + USUAL_COUNT))
+        if any(sigma > UNKNOWN_SIGMA[kind] for kind, sigma in level.items()):
+            return None
+        known = _of_levels(known, {kind: min(sigma, guessed[kind]) for kind, sigma in level.items()})
+    system, state, at = solve(problem, known, state, rounds=_SETTLING, bounds=(BOUND,))
+    return None if _scale_unseen(system, state, at) else known
 
 
 def _is_assumed(errors: PoseErrors, process: Process) -> bool:
