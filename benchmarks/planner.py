@@ -305,7 +305,7 @@ def films(options: argparse.Namespace) -> Lines:
         table.append([str(seed), *both, *(fixed(value, 1) for value in mean)])
     header = [f"{of.replace('_', ' ')}, {figure}" for figure in FIGURES for of in KINDS]
     lines = markdown_table(["world", *arms, *header], table)
-    return [*lines, "", *calibration(np.array(rows))]
+    return [*lines, "", *(calibration(np.array(rows)) if len(rows) > 2 else [])]
 
 
 def differences(one: Float, other: Float) -> Float:
