@@ -85,7 +85,7 @@ class Alternative:
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
     alike: bool = False  # of times of all cameras
-    flight: Sampled | None = None  # where a map and an actor are other than described
+    flight: Sampled | None = None  # where moments, a map or an actor are other than described
 
 
 @dataclass(frozen=True)
@@ -132,11 +132,20 @@ class Trial:
         stored = [camera.mount for camera in self.cameras]
         return np.array([_FLU_FROM_OPTICAL if each is None else each for each in stored])[:, None]
 
-    def with_times(self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0) -> SceneOfMoments:
-        """Add seconds to the times of cameras' pictures, and let them follow each other more slowly."""
+    def with_times(
+        self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0
+    ) -> tuple[SceneOfMoments, Sampled]:
+        """Add seconds to the times of cameras' pictures, and let them follow each other more slowly.
+
+        If all times are so wrong, the same pictures are looked at, at the times at which they were taken:
+        keypoints and their errors stay, and poses are others. Return the flight at these moments, too.
+        """
         late, factor = np.zeros(len(self.names)), np.ones(len(self.names))
         late[list(group)], factor[list(group)] = late_s, slower
-        return scene_of(self.flight, self.described, late_s=late, slower=factor)
+        if len(group) < len(self.names):
+            return scene_of(self.flight, self.described, late_s=late, slower=factor), self.flight
+        moved = self.flight.at_other_times(late_s, slower)
+        return scene_of(moved, late_s=late, slower=factor), moved
 
     def with_pixels(self, group: Sequence[int], change: Callable[[Float, Filmed], Float]) -> SceneOfMoments:
         """Change the pixels [F, J, 2] of cameras."""
@@ -170,14 +179,16 @@ def rates(trial: Trial) -> Iterator[Alternative]:
 
 def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> Alternative:
     """Change the frame rate of one camera, or of all."""
+    scene, flight = trial.with_times(group, slower=factor)
     return Alternative(
         "frame_rate",
         trial.named(group),
         f"the frame rate of {trial.whose(group)} is {1 / factor:.3g} times what is stated",
         remedies.frame_rate(trial.cameras, group, factor),
         price,
-        trial.with_times(group, slower=factor),
+        scene,
         alike=len(group) == len(trial.names),
+        flight=flight,
     )
 
 
@@ -194,14 +205,16 @@ def _unfilmed(camera: Filmed, slower: float = 1.0) -> float:
 
 def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
     """Move the clock of one camera, or of all."""
+    scene, flight = trial.with_times(group, late_s)
     return Alternative(
         "clock",
         trial.named(group),
         f"the pictures of {trial.whose(group)} were taken {remedies.earlier_or_later(late_s)}",
         remedies.clock(trial.cameras, group, late_s),
         1.0 + abs(late_s) / 2,
-        trial.with_times(group, late_s),
+        scene,
         alike=len(group) == len(trial.names),
+        flight=flight,
     )
 
 

@@ -392,7 +392,7 @@ class Objective:
 
         def saved(step: int) -> float:
             if step not in known:
-                scene = self.trial.with_times([index], step * _RAYS_STEP_S)
+                scene, _ = self.trial.with_times([index], step * _RAYS_STEP_S)
                 known[step] = self._fit(self._at_moments_of(scene)).cost - self._fit(scene).cost
             return known[step]
 
@@ -404,7 +404,7 @@ class Objective:
         if not best or saved(best) < least or not 0 < bend < np.inf:
             return None
         late_s = (best + (saved(best + 1) - saved(best - 1)) / (2 * bend)) * _RAYS_STEP_S
-        scene = self.trial.with_times([index], late_s)
+        scene, _ = self.trial.with_times([index], late_s)
         surer = float(np.log1p(late_s**2 * bend / 2 / _RAYS_STEP_S**2))
         cost = self._fit(scene).cost + surer + _OF_ANY_SIZE
         return self.scored(alternatives.clock(self.trial, [index], late_s), cost)._replace(numbers=1)
@@ -412,7 +412,7 @@ class Objective:
     def _at_moments_of(self, scene: SceneOfMoments) -> SceneOfMoments:
         """Return the description at the moments that a scene shows."""
         described = self.trial.described
-        seen = np.isfinite(scene.rays[..., :1]).any(axis=2, keepdims=True)
+        seen = np.isfinite(scene.rays[..., :1] + scene.position[:, :, None, :1]).any(axis=2, keepdims=True)
         return replace(described, rays=np.where(seen, described.rays, np.nan))
 
     def with_numbers(self, free: Numbers) -> Tried | None:
@@ -485,9 +485,11 @@ class Objective:
         before, total = self.described.cost, self.base.total
         if tried.alternative.code in (*TIMES, "videos_swapped"):
             same = self._at_moments_of(scene)
-            before = min(self._fit(same).cost, self._cost_of_pictures(scene))
+            before = self._fit(same).cost
             total = min(total, score(self.trial.flight, same, self.base).total)
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
+        if tried.alternative.code in (*TIMES, "videos_swapped") and not tried.alternative.alike:
+            before = min(before, self._cost_of_pictures(scene))
         if tried.alternative.code in TIMES:
             others = [self.trial.names.index(name) for name in tried.alternative.cameras]
             # Few rates are tried.
@@ -600,7 +602,7 @@ def _of_turns(objective: Objective, tried: Sequence[Lateness]) -> list[Tried]:
     def gain(late: Lateness) -> float:
         if len(late.cameras) == len(trial.names):
             return late.gain
-        scene = trial.with_times(late.cameras, late.late_s, late.slower)
+        scene, _ = trial.with_times(late.cameras, late.late_s, late.slower)
         found = objective.compared(objective.scored(Alternative("clock", (), "", "", np.inf, scene)))
         return late.gain + COST_OF_SCORE * found.gain
 

@@ -77,7 +77,19 @@ class Sampled(NamedTuple):
     second: Int64  # [T / 2]
     hips: Float | None  # [T, 3] m, logged; None without a logged actor
     ground: GroundOfMap | None
+    actor: LoggedActor | None = None
     truth_m: float | None = None  # stature of the true joints, if there are any
+
+    @property
+    def step_s(self) -> float:
+        """Time between the two moments of a pair."""
+        return float(self.t_ns[self.second[0]] - self.t_ns[self.first[0]]) / 1e9
+
+    def at_other_times(self, late_s: float, slower: float) -> Sampled:
+        """Move the moments to where the first camera shows the same pictures, if all times are so wrong."""
+        first_ns = self.cameras[0].entry.frames.first_t_ns
+        t_ns = first_ns + np.rint((self.t_ns - first_ns) * slower + late_s * 1e9).astype(np.int64)
+        return self._replace(t_ns=t_ns, hips=None if self.actor is None else self.actor.hips_at(t_ns))
 
     def scaled(self, factor: float) -> Sampled:
         """Scale the logged actor and the map."""
@@ -168,6 +180,7 @@ def sample(
         np.searchsorted(t_ns, before + STEP_NS),
         None if actor is None else actor.hips_at(t_ns),
         None if last_map is None else GroundOfMap.of(last_map),
+        actor,
     )
 
 
@@ -526,7 +539,7 @@ class Body:
             white_m: by how much pose errors that are new in every pose move the person.
             keypoint_m: by how much keypoints' errors move a joint.
         """
-        step_s = STEP_NS / 1e9
+        step_s = flight.step_s
         noise = np.sqrt(2) * white_m / step_s  # m/s
         moved = (self.hips[flight.second] - self.hips[flight.first]) / step_s
         pace = np.linalg.norm(moved[:, :2], axis=-1)
@@ -563,8 +576,8 @@ class Body:
                 for name in ("left_ankle", "right_ankle")
             )
         )
-        pace, legs = way_m / way_s, way_m / way_s - left_m / (STEP_NS / 1e9)
-        known = np.isfinite(legs) & (pace > _LEAST_TREAD_MPS) & (way_s > 3 * STEP_NS / 1e9)
+        pace, legs = way_m / way_s, way_m / way_s - left_m / flight.step_s
+        known = np.isfinite(legs) & (pace > _LEAST_TREAD_MPS) & (way_s > 3 * flight.step_s)
         if known.sum() < _FEWEST_TREADS:
             return Oddity(0.0, {})
         walked = float(pace[known].mean())
