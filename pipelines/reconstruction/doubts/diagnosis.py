@@ -119,7 +119,7 @@ _REACH = 1.0
 _WITHOUT_CAUSE = 9.0
 # Rays of a right flight scatter and miss each other by less, also where a remedy is not exact.
 _MEETING, _LEFT_MISFIT = 0.9, 2.5
-# Sums of chi^2 in other pictures, of which a clock's search tries many, differ by so many deviations.
+# Sums of chi^2 in other pictures or poses, of which many are tried, differ by so many deviations.
 _MOST_BY_CHANCE = 2.0
 # In this time people and cameras move by more than keypoints err; so far is a clock followed.
 _RAYS_STEP_S, _MOST_STEPS = 0.05, 20
@@ -492,9 +492,9 @@ class Objective:
             before = min(before, self._cost_of_pictures(scene))
         if tried.alternative.code in TIMES:
             others = [self.trial.names.index(name) for name in tried.alternative.cameras]
-            # Few rates are tried.
-            sigmas = 1.0 if tried.alternative.code == "frame_rate" else _MOST_BY_CHANCE
-            chance = sigmas * self._chance(before, others)
+            # Few rates of one camera are tried, and how its rays meet the others' shows them.
+            one_rate = tried.alternative.code == "frame_rate" and not tried.alternative.alike
+            chance = (1.0 if one_rate else _MOST_BY_CHANCE) * self._chance(before, others)
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
         rays = (self._rays(before, described), self._rays(cost, scene))
