@@ -118,7 +118,7 @@ def _checked(
         folder, description, detected, min_confidence=MIN_CONFIDENCE, pose_noise=pose_noise
     )
     actors = logged_people(folder, description)
-    found, association = find_people(cameras, description.pose_interpolation, actors)
+    found, association, _ = find_people(cameras, description.pose_interpolation, actors)
     moving = [] if session.intact_record(BACKGROUND.name) is None else [c for c in cameras if not c.static]
     tracks = {camera.name: load_tracks(folder, camera) for camera in moving}
     doubts = doubts_of(

@@ -6,7 +6,7 @@ status that gives the reason.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -32,6 +32,7 @@ from pipelines.keypoints.bodies import SightLines
 from pipelines.keypoints.corrections import (
     measured_for,
     read_calibration,
+    swaps_across_views,
     undo_swaps_of_tracks,
 )
 from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras, turned_aside
@@ -73,6 +74,7 @@ from pipelines.reconstruction.observations import (
     Observations,
     candidates,
     observe,
+    on_sides,
     readout_of,
     time_base,
 )
@@ -405,7 +407,7 @@ def _counts(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, ob
     return {
         **metrics["status_counts"],
         "association": {name: getattr(attempt.association, name).tolist() for name in events},
-        "left_right_swaps": {"undone_over_time": swaps},
+        "left_right_swaps": {"undone_over_time": swaps, "between_views": attempt.between_views},
         "filled": metrics["filled"],
         "smoothing": metrics["smoothing"],
     }
@@ -551,6 +553,7 @@ class Attempt:
     result: Triangulation
     found: Candidates
     association: Association
+    between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
     metrics: dict[str, Any]
     poses: pd.DataFrame | None  # of every picture, if they are not those of the log
     warnings: list[str]
@@ -624,6 +627,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         result,
         seen.found,
         seen.association,
+        seen.between_views,
         metrics
         | finished
         | {"people": people}
@@ -800,6 +804,7 @@ def _robust_flight(
         seen.found,
         seen.association.choice,
         seen.observations,
+        seen.sides,
         made.views,
         made.result,
         prior=load_pose_errors(flight.description, cameras, flight.settings.pose_noise),
@@ -836,14 +841,16 @@ class _Seen:
 
     found: Candidates
     association: Association
-    observations: Observations  # at the skeleton's times
+    observations: Observations  # at the skeleton's times, on these sides
+    sides: Int64  # [T, P, J, C], see `on_sides`
+    between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
     anybody: Bool  # [T] True if any person was detected
 
 
 def _observe(flight: LoadedFlight, cameras: list[Camera]) -> _Seen:
-    """Associate people, and interpolate their keypoints to common times."""
+    """Associate people, interpolate their keypoints to common times, and correct left-right swaps."""
     between, people = flight.between, flight.settings.people
-    found, association = find_people(
+    found, association, sigma = find_people(
         cameras,
         between,
         flight.actors,
@@ -854,7 +861,10 @@ def _observe(flight: LoadedFlight, cameras: list[Camera]) -> _Seen:
     observations = observe(cameras, found, association.choice, base, between)
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     anybody = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
-    return _Seen(found, association, observations, anybody)
+    sides, between_views = _agreeing_sides(observations, sigma[nearest])
+    rays, confidence = on_sides(observations.rays, observations.confidence, sides)
+    observations = replace(observations, rays=rays, confidence=confidence)
+    return _Seen(found, association, observations, sides, between_views, anybody)
 
 
 def find_people(
@@ -864,8 +874,8 @@ def find_people(
     *,
     people: int | None = 1,
     ground: Ground | None = None,
-) -> tuple[Candidates, Association]:
-    """Collect all detections at common times, and associate them with people, logged first."""
+) -> tuple[Candidates, Association, Float]:
+    """Collect all detections at common times, associate them with people, logged first; see `ray_sigma`."""
     found = candidates(cameras, between)
     sigma = ray_sigma(cameras, found.t_ns, found.position)
     time_s = (found.t_ns - found.t_ns[0]) / 1e9
@@ -875,7 +885,7 @@ def find_people(
         association = associate_one_camera(time_s, views, actors=logged, people=people)
     else:
         association = associate(time_s, *views, actors=logged, people=people, ground=ground)
-    return found, association
+    return found, association, sigma
 
 
 def chosen_detections(cameras: Sequence[Camera], found: Candidates, association: Association) -> list[Int64]:
@@ -919,3 +929,19 @@ def _poses_stored(
         return refined.cameras
     corrected = [camera for camera in cameras if background is not None and background[camera.name]["used"]]
     return camera_poses_table(corrected, between) if corrected else None
+
+
+def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, dict[str, int]]:
+    """Find the sides [T, P, J, C] on which most cameras agree; see `swaps_across_views`."""
+    sides = np.empty(observations.confidence.shape, dtype=np.int64)
+    total: Counter[str] = Counter()
+    for person in range(observations.rays.shape[1]):
+        sides[:, person], counts = swaps_across_views(
+            observations.rays[:, person],
+            observations.position,
+            observations.rotation,
+            sigma,
+            observations.joints,
+        )
+        total.update(counts)
+    return sides, dict(sorted(total.items()))

@@ -9,12 +9,17 @@ majority decides which side is right: an exchange in most pictures cannot be det
 Exchanges often begin or end where legs cross in the picture. Nothing jumps there, and detectors place joints
 that hide each other badly. Crossings are therefore no evidence: a jump at one end is needed, and the nearer
 one of the crossings before and behind it is the other end.
+
+Across cameras, at one time: if the viewing rays of a limb's joints do not meet, exchanging left and right in
+one or two cameras can make them meet. All sets of one or two cameras are tried, first for each limb, then for
+each pair of joints.
 """
 
 import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +27,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached
+from pipelines.keypoints.bodies import meeting_points, rays_of
 from pipelines.session.people import mirrored
 from pipelines.session.records import Detections
 
@@ -264,6 +270,119 @@ def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bool:
         best_now = best_last
         best_last = before
     return path
+
+
+# At most this many cameras are tried as wrong at once.
+_MAX_WRONG_CAMERAS = 2
+# An exchange must save this many variances of squared misses.
+_MIN_GAIN = 16.0
+_BAD, _GOOD = 5.0, 4.0  # mean squared miss of the rays of one camera before and after it; 2 is expected
+# The rays of this many times are in memory together.
+_BLOCK = 4096
+# A single ray counts up to five standard deviations.
+_MAX_MISS = 25.0
+
+
+def swaps_across_views(
+    xy: Float, position: Float, rotation: Float, sigma: Float, joints: Sequence[str]
+) -> tuple[Int64, dict[str, int]]:
+    """Find the side of each joint where the rays of the other cameras meet.
+
+    If an exchange in exactly half of the cameras (one of two) mends it, the right half is unknown: the limb
+    is dropped from all cameras at that time. `xy` [T, J, C, 2] are one person's joints, undistorted and
+    normalised, NaN not seen; poses are world_from_camera [T, C, 3] m, NaN without one, and [T, C, 3, 3];
+    `sigma` [T, C] rad is the deviation of a ray on each axis, of pixels and poses together.
+
+    Returns the joint [T, J, C] whose view belongs to each joint: its own number, its mirror's if the two are
+    exchanged, -1 if it is dropped; and the numbers of joint views `undone` and `dropped`.
+    """
+    xy, sides = xy.copy(), np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2]))
+    counts: Counter[str] = Counter()
+    limbs = [pairs for pairs in limb_pairs(joints).values() if len(pairs) > 1]
+    for group in [*limbs, *([pair] for pair in mirrored_pairs(joints).values())]:
+        parts = [
+            _wrong_views(
+                xy[rows][:, np.ravel(group)], position[rows], rotation[rows], sigma[rows], len(group)
+            )
+            for rows in (slice(k, k + _BLOCK) for k in range(0, max(len(xy), 1), _BLOCK))
+        ]
+        flipped, undecided = (np.concatenate(each) for each in zip(*parts, strict=True))
+        for left, right in group:
+            for values in (xy, sides):
+                a, b = values[:, left], values[:, right]
+                a[flipped], b[flipped] = b[flipped], a[flipped]
+            for side in (left, right):
+                counts["undone"] += int((flipped & np.isfinite(xy[:, side, :, 0])).sum())
+                counts["dropped"] += int((undecided[:, None] & np.isfinite(xy[:, side, :, 0])).sum())
+                xy[undecided, side] = np.nan
+                sides[undecided, side] = -1
+    return sides, dict(+counts)
+
+
+def _wrong_views(xy: Float, position: Float, rotation: Float, sigma: Float, pairs: int) -> tuple[Bool, Bool]:
+    """Find in which views a limb [T, 2 K, C, 2] (left, right, ...) is exchanged [T, C], or undecided [T]."""
+    times, _, cameras, _ = xy.shape
+    flipped, undecided = np.zeros((times, cameras), np.bool_), np.zeros(times, np.bool_)
+    rays = np.moveaxis(rays_of(np.moveaxis(xy, 2, 1), rotation), 1, 2).reshape(times, pairs, 2, cameras, 3)
+    posed = np.asarray(np.isfinite(position).all(-1))[:, None, None]
+    seen: Bool = np.asarray(np.isfinite(rays).all(-1)) & posed
+    both = np.asarray(np.all(seen, axis=2))
+    whole = np.asarray(np.any(both, axis=1))  # [T, C] cameras that see both sides of some pair
+    misses = _misses(rays, seen, position, sigma)
+    worst = np.max([_mean(misses[..., camera]) for camera in range(cameras)], axis=0)
+    (rows,) = np.nonzero((np.sum(whole, axis=1) >= 2) & (worst > _BAD))
+    if not len(rows):
+        return flipped, undecided
+    rays, seen, whole = rays[rows], seen[rows], whole[rows]
+    position, sigma = position[rows], sigma[rows]
+    views = np.sum(whole, axis=1)
+    apart2 = np.nansum((xy[rows, ::2] - xy[rows, 1::2]) ** 2, axis=(1, 3)) / sigma**2
+    whole &= apart2 > VISIBLE
+    before = _capped(misses[rows])
+    least = before - _MIN_GAIN
+    best = np.zeros((len(rows), cameras), np.bool_)
+    for count in range(1, _MAX_WRONG_CAMERAS + 1):
+        for chosen in combinations(range(cameras), count):
+            own = list(chosen)
+            allowed = whole[:, own].all(1) & (2 * count <= views)
+            other, there = rays.copy(), seen.copy()
+            other[..., own, :] = rays[:, :, ::-1, own]
+            there[..., own] = seen[:, :, ::-1, own]
+            tried = _misses(other, there, position, sigma)
+            after = _capped(tried) + _MIN_GAIN * (count - 1)
+            better = allowed & (after < least) & (_mean(tried[..., own]) < _GOOD)
+            least = np.where(better, after, least)
+            best[better] = np.isin(np.arange(cameras), own)
+    half = 2 * best.sum(1) == views
+    flipped[rows] = best & ~half[:, None]
+    undecided[rows] = half & best.any(1)
+    return flipped, undecided
+
+
+def _misses(rays: Float, seen: Bool, position: Float, sigma: Float) -> Float:
+    """Compute squared distances [T, K, 2, C] of rays from their common point, in variances; NaN if unseen."""
+    weight = np.where(seen, 1 / sigma[:, None, None] ** 2, 0.0)
+    rays = np.where(seen[..., None], rays, 0.0)
+    origin = np.broadcast_to(np.nan_to_num(position)[:, None, None], rays.shape)
+    points, _ = meeting_points(rays, origin, weight)
+    sight = points[..., None, :] - origin
+    depth = (rays * sight).sum(axis=-1)
+    offset2 = ((sight - depth[..., None] * rays) ** 2).sum(axis=-1)
+    variance = (np.maximum(depth, 1e-6) * sigma[:, None, None]) ** 2
+    return np.where(seen & np.isfinite(points[..., :1]), offset2 / variance, np.nan)
+
+
+def _mean(misses: Float) -> Float:
+    """Compute the mean [T] of the finite values; 0 if there are none."""
+    axes = tuple(range(1, misses.ndim))
+    count = np.isfinite(misses).sum(axis=axes)
+    mean: Float = np.nansum(misses, axis=axes) / np.maximum(count, 1)
+    return mean
+
+
+def _capped(misses: Float) -> Float:
+    total: Float = np.nansum(np.minimum(misses, _MAX_MISS), axis=(1, 2, 3))
+    return total
 
 
 # --- confidences -----------------------------------------------------------------------------------------

@@ -242,6 +242,14 @@ def observe(
     )
 
 
+def on_sides(rays: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
+    """Give each joint [T, P, J, ...] the view of the joint in `sides`, -1 for none: NaN and 0 then."""
+    kept, joint = sides >= 0, np.maximum(sides, 0)
+    own_xy = np.take_along_axis(rays, joint[..., None], axis=2)
+    own_confidence = np.take_along_axis(confidence, joint, axis=2)
+    return np.where(kept[..., None], own_xy, np.nan), np.where(kept, own_confidence, 0.0)
+
+
 def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
     """Build pose noise [T, C, 2] as stated, else the others' median; a static camera without it is exact."""
     stated = [sigma for sigma in sigmas if sigma is not None]

@@ -48,6 +48,7 @@ from pipelines.reconstruction.observations import (
     Candidates,
     Observations,
     observe,
+    on_sides,
     sightings_of,
 )
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
@@ -100,7 +101,8 @@ class RobustFlight:
     cameras: Sequence[Camera]  # all of them
     found: Candidates  # every detection, at the times at which people were associated
     choice: Int64  # [T', C, P] each person's detection, see `observe`
-    observations: Observations  # at the skeleton's times
+    observations: Observations  # at the skeleton's times, on those sides
+    sides: Int64  # [T, P, J, C] the joint whose view belongs to each joint, -1 for none, see `on_sides`
     views: Views  # the same, one row for each joint-frame
     result: Triangulation  # `robust` of the views
     prior: Sequence[PoseErrors] | None  # of each camera's pose; None without stated noise
@@ -369,13 +371,15 @@ def _observe_with_offsets(
 ) -> tuple[Observations, Views]:
     """Observe with these clock offsets, at some times of the skeleton."""
     cameras = shifted(flight.cameras, offset_s)
-    t_ns = flight.observations.t_ns[times]
+    t_ns, sides = flight.observations.t_ns[times], flight.sides[times]
     observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between)
-    rows = observed.confidence[..., 0].size
+    rays, confidence = on_sides(observed.rays, observed.confidence, sides)
+    observed = replace(observed, rays=rays, confidence=confidence)
+    rows = confidence[..., 0].size
     return observed, replace(
         flight.views,
-        rays=observed.rays.reshape(rows, len(cameras), 2),
-        weight=observed.confidence.reshape(rows, len(cameras)),
+        rays=rays.reshape(rows, len(cameras), 2),
+        weight=confidence.reshape(rows, len(cameras)),
         pose_index=flight.views.pose_index[:rows],
         position=observed.position,
         rotation=observed.rotation,
@@ -414,7 +418,9 @@ def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
 def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
     """Build the sighting of camera `c`, its clock shifted, in its pictures, all people side by side."""
     t_ns, frame_t_ns = flight.observations.t_ns, camera.frame_t_ns
-    rays, confidence = sightings_of(camera, flight.found, c, flight.choice[:, c])
+    nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, frame_t_ns)
+    seen = sightings_of(camera, flight.found, c, flight.choice[:, c])
+    rays, confidence = on_sides(*seen, flight.sides[nearest][..., c])
     position, rotation = camera.poses_at(frame_t_ns, flight.between)
     return Sighting(
         t_s=(frame_t_ns - t_ns[0]) / 1e9,

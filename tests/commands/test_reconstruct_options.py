@@ -19,6 +19,7 @@ from mocap_cli.reconstruct import reconstruct_command
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.geometry.joint_angles import ANGLES, joint_angles
 from pipelines.geometry.rig import BONES, CENTRES
+from pipelines.session.people import mirrored
 from pipelines.session.storage import read_json
 from tests.commands.runner import ingested, measured, mocap, result_of, succeeds
 from tests.commands.test_simulate import simulated
@@ -454,6 +455,20 @@ def test_refined_halves_the_error_of_noisy_poses_and_writes_them(tmp_path: Path)
     assert np.mean(errors) < 0.2 * np.sqrt(3)
 
 
+def test_refined_takes_the_sides_on_which_the_views_agreed(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=4, seconds=1.5, pose_noise=GOOD)
+    # A camera that calls left right all the time: only the other cameras tell.
+    exchange_sides(tmp_path / "drone1.json", flight.joints)
+    session = ingested(flight)
+    robust = measured(session)
+    refined = result_of("reconstruct", session, "--method", "refined")
+    counts = read_json(session / "reconstruct" / "stage.json")["counts"]
+    assert counts["left_right_swaps"]["between_views"]["undone"] > 0
+    # With a quarter of the views on the wrong sides it is no better than what it started from.
+    assert refined["refinement"]["fallback"] is None
+    assert refined["mpjpe_mm"] < 0.5 * robust["mpjpe_mm"]
+
+
 def a_second_late(folder: Path) -> SyntheticFlight:
     """Write a flight with a wrong clock that is stated as known; no pose errors explain its keypoints.
 
@@ -496,6 +511,15 @@ def test_refined_falls_back_to_what_robust_gives_and_says_why(
         name: robust[name] for name in robust.keys() - of_refined_alone
     }
     assert set(refined["clock_offsets_s"].values()) == {0.0}
+
+
+def exchange_sides(keypoints: Path, joints: tuple[str, ...]) -> None:
+    """Name all left joints of an AlphaPose file right, and all right ones left."""
+    mirror = [joints.index(mirrored(joint)) for joint in joints]
+    people = json.loads(keypoints.read_text(encoding="utf-8"))
+    for person in people:
+        person["keypoints"] = np.reshape(person["keypoints"], (-1, 3))[mirror].ravel().tolist()
+    keypoints.write_text(json.dumps(people), encoding="utf-8")
 
 
 def test_a_person_whose_views_show_two_bodies_moves_no_cameras(tmp_path: Path) -> None:
