@@ -84,8 +84,10 @@ class Alternative:
     scene: SceneOfMoments | None = None  # None of what is seen directly
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
-    alike: bool = False  # of times of all cameras
-    flight: Sampled | None = None  # where moments, a map or an actor are other than described
+    alike: Callable[[], tuple[SceneOfMoments, Sampled]] | None = (
+        None  # times of all cameras, by the same pictures
+    )
+    flight: Sampled | None = None  # where a map and an actor are other than described
 
 
 @dataclass(frozen=True)
@@ -132,19 +134,16 @@ class Trial:
         stored = [camera.mount for camera in self.cameras]
         return np.array([_FLU_FROM_OPTICAL if each is None else each for each in stored])[:, None]
 
-    def with_times(
-        self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0
-    ) -> tuple[SceneOfMoments, Sampled]:
-        """Add seconds to the times of cameras' pictures, and let them follow each other more slowly.
-
-        If all times are so wrong, the same pictures are looked at, at the times at which they were taken:
-        keypoints and their errors stay, and poses are others. Return the flight at these moments, too.
-        """
+    def with_times(self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0) -> SceneOfMoments:
+        """Add seconds to the times of cameras' pictures, and let them follow each other more slowly."""
         late, factor = np.zeros(len(self.names)), np.ones(len(self.names))
         late[list(group)], factor[list(group)] = late_s, slower
-        if len(group) < len(self.names):
-            return scene_of(self.flight, self.described, late_s=late, slower=factor), self.flight
+        return scene_of(self.flight, self.described, late_s=late, slower=factor)
+
+    def with_all_times(self, late_s: float = 0.0, slower: float = 1.0) -> tuple[SceneOfMoments, Sampled]:
+        """Change all times and look at the same pictures, at the moments at which they were taken then."""
         moved = self.flight.at_other_times(late_s, slower)
+        late, factor = np.full(len(self.names), late_s), np.full(len(self.names), slower)
         return scene_of(moved, late_s=late, slower=factor), moved
 
     def with_pixels(self, group: Sequence[int], change: Callable[[Float, Filmed], Float]) -> SceneOfMoments:
@@ -179,16 +178,15 @@ def rates(trial: Trial) -> Iterator[Alternative]:
 
 def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> Alternative:
     """Change the frame rate of one camera, or of all."""
-    scene, flight = trial.with_times(group, slower=factor)
+    alike = len(group) == len(trial.names)
     return Alternative(
         "frame_rate",
         trial.named(group),
         f"the frame rate of {trial.whose(group)} is {1 / factor:.3g} times what is stated",
         remedies.frame_rate(trial.cameras, group, factor),
         price,
-        scene,
-        alike=len(group) == len(trial.names),
-        flight=flight,
+        trial.with_times(group, slower=factor),
+        alike=partial(trial.with_all_times, 0.0, factor) if alike else None,
     )
 
 
@@ -205,16 +203,15 @@ def _unfilmed(camera: Filmed, slower: float = 1.0) -> float:
 
 def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
     """Move the clock of one camera, or of all."""
-    scene, flight = trial.with_times(group, late_s)
+    alike = len(group) == len(trial.names)
     return Alternative(
         "clock",
         trial.named(group),
         f"the pictures of {trial.whose(group)} were taken {remedies.earlier_or_later(late_s)}",
         remedies.clock(trial.cameras, group, late_s),
         1.0 + abs(late_s) / 2,
-        scene,
-        alike=len(group) == len(trial.names),
-        flight=flight,
+        trial.with_times(group, late_s),
+        alike=partial(trial.with_all_times, late_s) if alike else None,
     )
 
 

@@ -119,7 +119,7 @@ _REACH = 1.0
 _WITHOUT_CAUSE = 9.0
 # Rays of a right flight scatter and miss each other by less, also where a remedy is not exact.
 _MEETING, _LEFT_MISFIT = 0.9, 2.5
-# Sums of chi^2 in other pictures or poses, of which many are tried, differ by so many deviations.
+# Sums of chi^2 in other pictures, of which a clock's search tries many, differ by so many deviations.
 _MOST_BY_CHANCE = 2.0
 # In this time people and cameras move by more than keypoints err; so far is a clock followed.
 _RAYS_STEP_S, _MOST_STEPS = 0.05, 20
@@ -392,7 +392,7 @@ class Objective:
 
         def saved(step: int) -> float:
             if step not in known:
-                scene, _ = self.trial.with_times([index], step * _RAYS_STEP_S)
+                scene = self.trial.with_times([index], step * _RAYS_STEP_S)
                 known[step] = self._fit(self._at_moments_of(scene)).cost - self._fit(scene).cost
             return known[step]
 
@@ -404,7 +404,7 @@ class Objective:
         if not best or saved(best) < least or not 0 < bend < np.inf:
             return None
         late_s = (best + (saved(best + 1) - saved(best - 1)) / (2 * bend)) * _RAYS_STEP_S
-        scene, _ = self.trial.with_times([index], late_s)
+        scene = self.trial.with_times([index], late_s)
         surer = float(np.log1p(late_s**2 * bend / 2 / _RAYS_STEP_S**2))
         cost = self._fit(scene).cost + surer + _OF_ANY_SIZE
         return self.scored(alternatives.clock(self.trial, [index], late_s), cost)._replace(numbers=1)
@@ -477,7 +477,9 @@ class Objective:
         """Compare an alternative and its price with the description.
 
         Other times leave moments and pictures out: then the description is judged by the same ones, since
-        those left out may show somebody else. Larger errors excuse everything: of them only the chi^2 counts.
+        those left out may show somebody else. Where all times are others, either pictures or poses are others,
+        with other errors: the less counts that one of them saves. Larger errors excuse everything: of them only
+        the chi^2 counts.
         """
         scene, described = tried.alternative.scene, self.trial.described
         if scene is None or tried.score is None:
@@ -485,16 +487,18 @@ class Objective:
         before, total = self.described.cost, self.base.total
         if tried.alternative.code in (*TIMES, "videos_swapped"):
             same = self._at_moments_of(scene)
-            before = self._fit(same).cost
+            before = min(self._fit(same).cost, self._cost_of_pictures(scene))
             total = min(total, score(self.trial.flight, same, self.base).total)
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
-        if tried.alternative.code in (*TIMES, "videos_swapped") and not tried.alternative.alike:
-            before = min(before, self._cost_of_pictures(scene))
+        if tried.alternative.alike is not None:
+            of_poses, flight = tried.alternative.alike()
+            saved = self._fit(self._at_moments_of(of_poses)).cost - self._fit(of_poses, flight).cost
+            cost = max(cost, before - saved) if np.isfinite(saved) else np.inf
         if tried.alternative.code in TIMES:
             others = [self.trial.names.index(name) for name in tried.alternative.cameras]
-            # Few rates of one camera are tried, and how its rays meet the others' shows them.
-            one_rate = tried.alternative.code == "frame_rate" and not tried.alternative.alike
-            chance = (1.0 if one_rate else _MOST_BY_CHANCE) * self._chance(before, others)
+            # Few rates are tried.
+            sigmas = 1.0 if tried.alternative.code == "frame_rate" else _MOST_BY_CHANCE
+            chance = sigmas * self._chance(before, others)
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
         rays = (self._rays(before, described), self._rays(cost, scene))
@@ -602,7 +606,7 @@ def _of_turns(objective: Objective, tried: Sequence[Lateness]) -> list[Tried]:
     def gain(late: Lateness) -> float:
         if len(late.cameras) == len(trial.names):
             return late.gain
-        scene, _ = trial.with_times(late.cameras, late.late_s, late.slower)
+        scene = trial.with_times(late.cameras, late.late_s, late.slower)
         found = objective.compared(objective.scored(Alternative("clock", (), "", "", np.inf, scene)))
         return late.gain + COST_OF_SCORE * found.gain
 
