@@ -24,6 +24,7 @@ from pipelines.geometry.triangulation import STATUS, Method, Triangulation, View
 from pipelines.keypoints.association import (
     Association,
     Ground,
+    Surroundings,
     associate,
     associate_one_camera,
     level_of,
@@ -138,7 +139,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=51)
+RECONSTRUCT = Stage("reconstruct", revision=52)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -855,7 +856,7 @@ def _observe(flight: LoadedFlight, cameras: list[Camera]) -> _Seen:
         between,
         flight.actors,
         people=people if isinstance(people, int) else None,
-        ground=flight.ground,
+        scene=Surroundings(flight.ground, np.array([camera.field for camera in cameras])),
     )
     base = time_base(cameras, flight.settings.rate_hz)
     observations = observe(cameras, found, association.choice, base, between)
@@ -873,7 +874,7 @@ def find_people(
     actors: Sequence[LoggedActor],
     *,
     people: int | None = 1,
-    ground: Ground | None = None,
+    scene: Surroundings | None = None,
 ) -> tuple[Candidates, Association, Float]:
     """Collect all detections at common times, associate them with people, logged first; see `ray_sigma`."""
     found = candidates(cameras, between)
@@ -884,7 +885,7 @@ def find_people(
     if len(cameras) == 1:
         association = associate_one_camera(time_s, views, actors=logged, people=people)
     else:
-        association = associate(time_s, *views, actors=logged, people=people, ground=ground)
+        association = associate(time_s, *views, actors=logged, people=people, scene=scene)
     return found, association, sigma
 
 

@@ -43,7 +43,7 @@ from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.world import World
 
 # It is raised whenever the same scenario gives other files than before.
-_REVISION = 7
+_REVISION = 8
 _OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", SIMULATION_MARK)
 # An interrupt costs at most so many pictures, and a block still encodes well.
 _BLOCK = 60

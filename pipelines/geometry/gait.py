@@ -153,8 +153,10 @@ def _low_pass(values: Float, cutoff_hz: float, rate_hz: float) -> Float:
     """
     from scipy.linalg import solveh_banded
 
-    if cutoff_hz >= 0.45 * rate_hz:
+    if cutoff_hz >= 0.45 * rate_hz or len(values) < 3:
         return values
+    middle = values.mean(axis=0)  # far from the origin, rounding would count
+    values = values - middle
     stiffness = np.tan(np.pi * cutoff_hz / rate_hz) ** -4
     count = len(values) - 2
     band, right = np.zeros((3, len(values))), np.zeros_like(values)
@@ -164,7 +166,7 @@ def _low_pass(values: Float, cutoff_hz: float, rate_hz: float) -> Float:
         for j, other in enumerate((1.0, 2.0, 1.0)[i:]):
             sign = -1.0 if j == 1 else 1.0  # of neighbours in a difference
             band[j, i : i + count] += of * other * (1.0 + sign * stiffness)
-    return np.asarray(solveh_banded(band, right, lower=True))
+    return np.asarray(solveh_banded(band, right, lower=True) + middle)
 
 
 def _with_steps(found: list[tuple[int, int, bool, Float, float, float]], t_ns: Int64) -> GaitEvents:

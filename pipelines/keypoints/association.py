@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from pipelines.geometry.arrays import Bool, Float, Int64, known_median
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.keypoints.bodies import (
     SAME_BODY_M,
     Bodies,
@@ -81,14 +82,15 @@ def associate(
     actors: Float | None = None,
     actor_sigma_m: float = 1.0,
     people: int | None = 1,
-    ground: Ground | None = None,
+    scene: Surroundings | None = None,
 ) -> Association:
     """Choose the detections of the people who were logged, then of others, most seen first.
 
-    Detections are grouped into bodies (see `bodies`). Of the bodies each logged person is the one that fits
-    their log best, with the greatest sum over all; nobody stands in for a logged person whom no camera sees.
-    Others are those seen in most camera-frames by two cameras or more, ties by confidence. A lone view is
-    kept where its picture continues the person's last one.
+    Detections are grouped into bodies (see `bodies`); where several are seen, again without the pose errors
+    that all bodies of a picture share. Of the bodies each logged person is the one that fits their log best,
+    with the greatest sum over all; nobody stands in for a logged person whom no camera sees. Others are those
+    seen in most camera-frames by two cameras or more, ties by confidence. A lone view is kept where its
+    picture continues the person's last one.
 
     `xy` [T, C, D, J, 2] are undistorted and normalised, NaN for nothing; joints of `confidence` 0 or NaN are
     not used; poses [T, C, ...] are world_from_camera, NaN without one; `sigma` [T, C] rad is that of a ray
@@ -105,23 +107,29 @@ def associate(
         logs = np.stack([np.c_[log, np.full(len(log), actor_sigma_m)] for log in logged], axis=1)
     views = SightLines(xy, confidence, position, rotation, sigma)
     seen = find_bodies(time_s, views, logs)
+    again = False
     if logs is not None and len(logged) > 1:
         noise_m = _noise_of_logs_m(seen, logs[..., :3], actor_sigma_m)
         logs[..., 3] = noise_m
-        if noise_m < actor_sigma_m:
-            seen = find_bodies(time_s, views, logs, seen)
+        again = noise_m < actor_sigma_m
+    if ((seen.track >= 0).sum(axis=-1) > 1).any():
+        views, before = without_common_errors(time_s, views, seen), views
+        again |= views is not before
+    if again:
+        seen = find_bodies(time_s, views, logs, seen)
+    xy, confidence = views.xy, views.confidence
     tracks = _tracks(seen, np.where(np.isfinite(xy).all(-1) & (confidence > 0), confidence, 0.0))
     near, unseen, reasons = _near_logs(tracks, logged, noise_m, actor_sigma_m)
     chains, tracks = _chains(tracks, time_s, near, people)
     refused: Counter[str] = Counter()
-    if ground is None:
-        ground = level_of_most_seen(seen)
+    if scene is not None and scene.ground is None:
+        scene = scene._replace(ground=level_of_most_seen(seen))
     # Bodies are judged by the noise that they have.
     views = views._replace(sigma=views.sigma * max(seen.noise, 1.0))
     if people is None:
-        refused = _add_people(chains, tracks, time_s, seen.track, views, ground)
+        refused = _add_people(chains, tracks, time_s, seen.track, views, scene)
     bodies = [chain.body(seen.track) for chain in chains]
-    doubts = tuple(why_no_body(body, views, ground) for body in bodies)
+    doubts = tuple(why_no_body(body, views, scene) for body in bodies)
     chosen = np.stack([body.choice for body in bodies], axis=-1)
     resumed = np.array([max(0, len(chain.taken) - 1) for chain in chains], np.int64)
     if not np.any(chosen >= 0):
@@ -323,7 +331,7 @@ def _add_people(
     time_s: Float,
     track: Int64,
     views: SightLines,
-    ground: Ground | None,
+    scene: Surroundings | None,
 ) -> Counter[str]:
     """Add everybody else who is a person; return how many bodies are left out, by `why_no_person`."""
     refused: Counter[str] = Counter()
@@ -331,7 +339,7 @@ def _add_people(
     while tracks and len(chains) < _MAX_PEOPLE:
         chain, tracks = _next_chain(tracks, time_s)
         candidate = chain.body(track)
-        cause = why_no_person(candidate, people, time_s, views, ground)
+        cause = why_no_person(candidate, people, time_s, views, scene)
         if cause == "short":
             break
         if cause:
@@ -428,6 +436,106 @@ def _counted(
     )
 
 
+# --- errors of a whole picture ---------------------------------------------------------------------------
+
+# The errors of keypoints average out over this time, and those of poses hardly change.
+_ERROR_WINDOW_S = 0.5
+# The last round changes the disagreement by less than a tenth.
+_TURNS = 3
+# About this many joints are used, which is enough to average their errors.
+_FEW_JOINTS = 8
+# The rays of this many times take 30 MB of memory.
+_TIMES_AT_ONCE = 2_000
+# A larger correction means that the person may be none.
+_MAX_CORRECTION_SIGMAS = 3.0
+# If more of the first squares remains, the errors change from picture to picture.
+_MAX_REMAINING_SHARE = 0.4
+# Position errors move the far less than the near, so this share of the noise of rays remains.
+_REMAINING_NOISE_SHARE = 0.7
+
+
+def without_common_errors(time_s: Float, views: SightLines, seen: Bodies) -> SightLines:
+    """Turn the cameras so that the views of the person seen most agree.
+
+    A camera that is turned or shifted moves everybody in its picture by about the same. Without these errors,
+    which the views of one body show, two people who stand near each other are further apart than the views of
+    one person. Only the part on which views can disagree is found: cameras that all err alike still agree.
+    Views with other rotations and less noise are returned; the same ones where the errors do not last, and
+    without anybody whom two cameras see.
+    """
+    person = _most_seen(seen)
+    if person is None:
+        return views
+    detection = np.where(person.any(axis=-1), person.argmax(axis=-1), -1)
+    fewer = slice(None, None, max(1, views.xy.shape[3] // _FEW_JOINTS))
+    few = views._replace(xy=views.xy[..., fewer, :], confidence=views.confidence[..., fewer])
+    rotation = views.rotation.copy()
+    total = np.zeros((*views.sigma.shape, 2))
+    left = []
+    for _ in range(_TURNS):
+        missed = np.concatenate(
+            [
+                _missed(few, rotation, detection, slice(start, start + _TIMES_AT_ONCE))
+                for start in range(0, len(time_s), _TIMES_AT_ONCE)
+            ]
+        )
+        left.append(
+            float(np.mean(missed**2, where=np.isfinite(missed))) if np.isfinite(missed).any() else 0.0
+        )
+        # A mean of means has no negative weight at any frequency, so the rounds do not amplify one.
+        turn = np.stack([_mean(time_s, _mean(time_s, missed[:, c])) for c in range(missed.shape[1])], axis=1)
+        total += turn
+        across, along = np.moveaxis(turn, -1, 0)
+        vector = np.stack([-along, across, np.zeros_like(across)], axis=-1)
+        rotation = rotation @ matrix_from_quaternion(quaternion_from_rotation_vector(vector))
+    small = np.hypot(*np.moveaxis(total, -1, 0)) <= _MAX_CORRECTION_SIGMAS * views.sigma
+    if not left[-1] < _MAX_REMAINING_SHARE * left[0]:
+        return views
+    return views._replace(
+        rotation=np.where(small[..., None, None], rotation, views.rotation),
+        sigma=np.where(small, _REMAINING_NOISE_SHARE, 1.0) * views.sigma,
+    )
+
+
+def _most_seen(seen: Bodies) -> Bool | None:
+    """Find the detections [T, C, D] of the track whom two cameras or more see most; None without one."""
+    tracks, views = np.unique(seen.track[np.isfinite(seen.spread)], return_counts=True)
+    if not len(tracks):
+        return None
+    person = np.isfinite(seen.spread) & (seen.track == tracks[views.argmax()])
+    return np.asarray(person)
+
+
+def _missed(views: SightLines, rotation: Float, detection: Int64, rows: slice) -> Float:
+    """Compute how far a person's joints are from where they are seen [N, C, 2], median over joints."""
+    taken = np.maximum(detection[rows], 0)[..., None, None]
+    xy = np.take_along_axis(views.xy[rows], taken[..., None], axis=2)[:, :, 0]
+    confidence = np.take_along_axis(views.confidence[rows], taken, axis=2)[:, :, 0]
+    origin, rotation = np.nan_to_num(views.position[rows]), np.nan_to_num(rotation[rows])
+    there = (detection[rows] >= 0)[..., None] & (confidence > 0) & np.isfinite(xy).all(axis=-1)
+    there &= np.isfinite(views.position[rows][..., :1])
+    rays = np.moveaxis(rays_of(xy, rotation), 1, 2)
+    weight = np.moveaxis(np.asarray(there), 1, 2).astype(np.float64)
+    points, _ = meeting_points(rays, np.broadcast_to(origin[:, None], rays.shape), weight)
+    u, v, depth = np.einsum("ncji,nckj->inck", rotation, points[:, None] - origin[:, :, None])
+    ahead = np.where(there & (depth > 0), depth, np.nan)
+    return known_median(np.stack([u / ahead, v / ahead], axis=-1) - xy, axis=2)
+
+
+def _mean(time_s: Float, values: Float) -> Float:
+    """Average values [T, 2] within the window about each time; where none is, the nearest average; or 0."""
+    known = np.isfinite(values[:, 0])
+    if not known.any():
+        return np.zeros_like(values)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(np.c_[np.nan_to_num(values), known], axis=0)])
+    first = np.searchsorted(time_s, time_s - _ERROR_WINDOW_S / 2, side="left")
+    last = np.searchsorted(time_s, time_s + _ERROR_WINDOW_S / 2, side="right")
+    within = total[last] - total[first]
+    rows = np.flatnonzero(within[:, 2] > 0)
+    mean = within[rows, :2] / within[rows, 2:]
+    return np.stack([np.interp(time_s, time_s[rows], column) for column in mean.T], axis=1)
+
+
 # --- who is no person ------------------------------------------------------------------------------------
 
 # A body has a size, and people stand on the ground: what several cameras see has a place, which is near the
@@ -454,6 +562,13 @@ _HIP_HEIGHT_M = 0.95
 _GROUND_SIGMA_M = 1.0
 
 
+class Surroundings(NamedTuple):
+    """Surroundings of the people, as far as they are known."""
+
+    ground: Ground | None  # of a map or a log; without either it is that under who is seen most
+    fields: Float  # [C, 4] left, top, right, bottom of each camera's picture, normalised
+
+
 # Two cameras must see somebody for this long before they count as a person.
 _MIN_SIGHT_S = 1.0
 # A second body nearer to a person than this, never beside them in a picture, is theirs.
@@ -478,13 +593,14 @@ def why_no_person(
     people: list[PossiblePerson],
     time_s: Float,
     views: SightLines,
-    ground: Ground | None,
+    scene: Surroundings | None,
 ) -> str:
     """Say why a body that two cameras see is no further person to reconstruct; empty if it is one.
 
     "short": seen by two cameras for less than a second, or never together with anybody, as the pieces of one
     lost person; "same": alongside a person already taken, and never with them in one picture; "ground": too
-    high or too low; "size": not of a person's extent; "misfit": the views do not fit each other.
+    high or too low; "size": not of a person's extent; "misfit": the views do not fit each other; "bystander":
+    beyond the ring of the cameras, and never in all of their pictures.
     """
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     there: Bool = np.isfinite(body.middle[:, 0])
@@ -502,16 +618,18 @@ def why_no_person(
             return "same"
     if (there if not people else together).sum() * step_s < _MIN_SIGHT_S:
         return "short"
-    return why_no_body(body, views, ground)
+    if cause := why_no_body(body, views, scene):
+        return cause
+    return "bystander" if scene is not None and _is_bystander(body, people, views, scene.fields) else ""
 
 
-def why_no_body(body: PossiblePerson, views: SightLines, ground: Ground | None) -> str:
+def why_no_body(body: PossiblePerson, views: SightLines, scene: Surroundings | None) -> str:
     """Say why detections are no body ("ground", "size" or "misfit", as `why_no_person`); empty if one."""
     rows = np.flatnonzero(np.isfinite(body.middle[:, 0]))
     if not len(rows):
         return ""
-    if ground is not None:
-        level, doubt = ground(body.middle[rows])
+    if scene is not None and scene.ground is not None:
+        level, doubt = scene.ground(body.middle[rows])
         height = body.middle[rows, 2] - level
         known = np.isfinite(height)
         slack = _DOUBTED_SHARE * doubt[known]
@@ -522,6 +640,34 @@ def why_no_body(body: PossiblePerson, views: SightLines, ground: Ground | None) 
     if not _EXTENT_M[0] <= extent_m <= _EXTENT_M[1]:
         return "size"
     return "misfit" if misfit > _MAX_MISFIT else ""
+
+
+def _is_bystander(
+    body: PossiblePerson, people: list[PossiblePerson], views: SightLines, fields: Float
+) -> bool:
+    """Test if a body stands beyond the cameras that film the people, and never in all of their pictures."""
+    rows = np.flatnonzero(np.isfinite(body.middle[:, 0]))
+    off = np.array([np.hypot(*(body.middle[rows] - one.middle[rows]).T[:2]) for one in people])
+    if not np.isfinite(off).any():
+        return False
+    off = np.where(np.isfinite(off), off, np.inf)
+    nearest = np.array([one.middle[rows] for one in people])[off.argmin(axis=0), np.arange(len(rows))]
+    met = np.isfinite(nearest[:, 0])
+    rows, nearest, apart = rows[met], nearest[met], off.min(axis=0)[met]
+    position, rotation = views.position[rows], views.rotation[rows]
+    posed = np.isfinite(position).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    ring = np.where(posed, np.hypot(*np.moveaxis(position - nearest[:, None], -1, 0)[:2]), np.nan)
+    whole = np.ones(len(rows), np.bool_)
+    for c, field in enumerate(fields):
+        u, v, depth = np.einsum("nij,ni->jn", rotation[:, c], body.middle[rows] - position[:, c])
+        left, top, right, bottom = field
+        with np.errstate(invalid="ignore", divide="ignore"):
+            across, along = u / depth, v / depth
+            inside = (across > left) & (across < right) & (along > top) & (along < bottom)
+        shown = np.asarray(inside & (depth > 0), dtype=np.bool_)
+        whole &= shown | ~posed[:, c]
+    beyond = apart > np.nanmedian(ring, axis=1)
+    return bool(beyond.mean() > _MIN_REFUSED_SHARE and whole.mean() < _MIN_COMPANY_SHARE)
 
 
 def _body_of(choice: Int64, rows: NDArray[np.intp], views: SightLines) -> tuple[float, float]:

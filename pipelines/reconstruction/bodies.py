@@ -90,7 +90,8 @@ def _errors(
     size, axes = np.linalg.eigh((mean + np.swapaxes(mean, -1, -2)) / 2)
     found: Float = (axes * np.maximum(size, 0.0)[:, None]) @ np.swapaxes(axes, -1, -2)
     nearer = np.nan_to_num(ray / distance)
-    scale = np.einsum("nci,nij,ncj->nc", nearer, found, nearer).mean(axis=1)
+    posed = np.isfinite(ray).all(axis=-1).sum(axis=1)
+    scale = np.einsum("nci,nij,ncj->n", nearer, found, nearer) / np.maximum(posed, 1)
     return np.where(unknown, _UNKNOWN_M2 * np.eye(3), own), found, scale
 
 

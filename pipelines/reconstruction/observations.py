@@ -80,6 +80,14 @@ class Camera:
         """Mean focal length (px), to convert pixels to angles."""
         return (self.intrinsics.fx + self.intrinsics.fy) / 2
 
+    @cached_property
+    def field(self) -> Float:
+        """Left, top, right and bottom of its picture [4] as undistorted normalised image coordinates."""
+        right, bottom = self.intrinsics.width - 1.0, self.intrinsics.height - 1.0
+        x, y = right / 2, bottom / 2
+        middles = undistort(np.array([[0.0, y], [x, 0.0], [right, y], [x, bottom]]), self.intrinsics)
+        return middles[np.arange(4), [0, 1, 0, 1]]
+
     def seen(self) -> tuple[Float, Float]:
         """Compute its keypoints: rays [F, D, J, 2], NaN where nothing was found; confidences [F, D, J]."""
         found = self.detections

@@ -291,6 +291,7 @@ _NO_BODY = {
     "misfit": "seen at different places by different cameras",
     "residual": "its views disagree more than those of the first person",
     "same": "a second image of a person",
+    "bystander": "beyond the cameras and never in all of their pictures, a bystander",
 }
 
 

@@ -450,8 +450,13 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
         _refuse_newer_session(folder)
         if create:
             marks = ("ingest/stage.json", "ingest.new/stage.json")
-            if not (overwrite or any((folder / mark).is_file() for mark in marks)):
-                refuse_others(folder, _LEFT_BY_KILLED_INGEST.__contains__, "no session, but other files")
+            is_free = overwrite or any((folder / mark).is_file() for mark in marks)
+            refuse_others(
+                folder,
+                lambda name: is_free or name in _LEFT_BY_KILLED_INGEST,
+                "no session, but other files",
+                way="write into it",
+            )
             make_folder(folder)
         elif not was_interrupted(folder):
             _check_session(folder)

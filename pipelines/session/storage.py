@@ -500,7 +500,12 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
 
 
 def refuse_others(
-    target: Path, is_ours: Callable[[str], bool], held: str, *, option: str = "--output"
+    target: Path,
+    is_ours: Callable[[str], bool],
+    held: str,
+    *,
+    option: str = "--output",
+    way: str = "replace all of it",
 ) -> None:
     """Refuse, with a DataError, to replace a file, or a folder that has a name in it which is not ours."""
     if not target.exists():
@@ -510,7 +515,7 @@ def refuse_others(
         raise DataError(target, "is a file, not a folder", remedy, code="not-a-folder")
     if others := sorted(path.name for path in target.iterdir() if not is_ours(path.name)):
         problem = f"holds {held} ({len(others)} entries, the first {others[0]})"
-        remedy = f"choose another place with {option}, or write over it with --overwrite"
+        remedy = f"choose another place with {option}, or {way} with --overwrite"
         raise DataError(target, problem, remedy, code="exists")
 
 

@@ -78,16 +78,17 @@ def invert_pose(source: Path, camera: str, rotation: Float, translation: Float) 
     from scipy.spatial.transform import Rotation
 
     # NaN fails the comparisons, too.
-    usable = translation.shape == (3,) and bool((np.abs(translation) < _LARGEST).all())
-    usable &= bool((np.abs(rotation) < _LARGEST).all())
+    is_turn = bool((np.abs(rotation) < _LARGEST).all())
     quaternion_xyzw = rotation
     if rotation.shape == (3,):
-        quaternion_xyzw = Rotation.from_rotvec(rotation).as_quat() if usable else np.zeros(4)
+        quaternion_xyzw = Rotation.from_rotvec(rotation).as_quat() if is_turn else np.zeros(4)
     elif rotation.shape == (3, 3):
-        usable &= np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
-        quaternion_xyzw = Rotation.from_matrix(rotation).as_quat() if usable else np.zeros(4)
-    if not usable or quaternion_xyzw.shape != (4,) or np.linalg.norm(quaternion_xyzw) < 1e-9:
-        raise DataError(source, f"camera {camera}: its rotation and translation are no pose")
+        is_turn &= np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+        quaternion_xyzw = Rotation.from_matrix(rotation).as_quat() if is_turn else np.zeros(4)
+    if not is_turn or quaternion_xyzw.shape != (4,) or np.linalg.norm(quaternion_xyzw) < 1e-9:
+        raise DataError(source, f"camera {camera}: what is given as its rotation is none")
+    if translation.shape != (3,) or not (np.abs(translation) < _LARGEST).all():
+        raise DataError(source, f"camera {camera}: its translation is no vector of three numbers")
     world_from_camera = Rotation.from_quat(quaternion_xyzw).inv()
     return -world_from_camera.apply(translation), world_from_camera.as_quat()
 

@@ -477,9 +477,9 @@ class Objective:
         """Compare an alternative and its price with the description.
 
         Other times leave moments and pictures out: then the description is judged by the same ones, since
-        those left out may show somebody else. Where all times are others, either pictures or poses are others,
-        with other errors: the less counts that one of them saves. Larger errors excuse everything: of them only
-        the chi^2 counts.
+        those left out may show somebody else. If all times are others, pictures or poses are others, with
+        other errors: whichever saves less counts. Larger errors excuse everything: of them only the chi^2
+        counts.
         """
         scene, described = tried.alternative.scene, self.trial.described
         if scene is None or tried.score is None:
@@ -496,9 +496,9 @@ class Objective:
             cost = max(cost, before - saved) if np.isfinite(saved) else np.inf
         if tried.alternative.code in TIMES:
             others = [self.trial.names.index(name) for name in tried.alternative.cameras]
-            # Few rates are tried.
-            sigmas = 1.0 if tried.alternative.code == "frame_rate" else _MOST_BY_CHANCE
-            chance = sigmas * self._chance(before, others)
+            # Few rates of one camera are tried, and its rays must go on meeting those of the others.
+            one_rate = tried.alternative.code == "frame_rate" and tried.alternative.alike is None
+            chance = (1.0 if one_rate else _MOST_BY_CHANCE) * self._chance(before, others)
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
         rays = (self._rays(before, described), self._rays(cost, scene))
