@@ -67,10 +67,7 @@ SPECIAL: dict[str, tuple[str, Any]] = {
     "levels of constant errors": ("reconstruction.refinement.refine._with_constant_levels", lambda *_: None),
     "faster motion": ("reconstruction.refinement.refine._FAST_MOTION", 1.0),
     "swaps over time": ("reconstruct._without_swaps", lambda cameras, _: (cameras, {})),
-    "swaps between views": (
-        "reconstruct.swaps_across_views",
-        lambda xy, *_: (np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2])), {}),
-    ),
+    "swaps between views": ("keypoints.corrections._MIN_GAIN", np.inf),
 }
 """Special cases of `auto`: the name in pipelines that is replaced, and the value without the case."""
 GIVEN: tuple[Given, ...] = ("model", "nothing")

@@ -136,7 +136,7 @@ def _figures(
         off.append(np.degrees(np.sqrt(np.square(apart).sum(axis=1).mean())))
         nees.append(np.square(apart.mean(axis=0)).sum() / (3 * laid.common_sigma_rad**2))
     shown = [f"{np.median(off):.2f}", f"{np.mean(nees):.1f}"] if off else ["-", "-"]
-    return [f"{refused} of {draws}", *shown]
+    return [f"{refused}/{draws}", *shown]
 
 
 def joined(name: str) -> list[str]:

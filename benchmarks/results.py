@@ -107,8 +107,8 @@ SECTIONS = (
     Section(
         "Planner",
         "Flights are closed loops of point masses. Tilt is the elevation of cameras above the person."
-        " Errors are those of joints that all arms measured. Differences are of `adaptive` less the flight as"
-        " flown; by keypoints: of the model with what the detector found in the films.",
+        " Errors are those of joints that all arms measured. Differences: `adaptive` less the flight as"
+        " flown; by keypoints: the model with those of the films.",
         (
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
             Part("planner-worlds", "Random worlds", MODELLED, ""),
@@ -319,7 +319,7 @@ def measure_studies() -> None:
         _run(command.replace("FOLDER", str(PLACE / key)))
         lines: list[str] = []
         for table in tables(read_json(PLACE / key / "metrics.json")):
-            if table.title.startswith(("MPJPE, ", "Root-relative MPJPE")):
+            if table.title.startswith("MPJPE, "):
                 rows = [[row[0], *(cell.partition(" [")[0] for cell in row[2:])] for row in table.rows]
                 header = [f"noise; {table.title}", *table.header[2:]]
                 lines += [*markdown_table(header, rows), ""]
