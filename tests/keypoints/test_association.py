@@ -23,9 +23,8 @@ from pipelines.keypoints.association import (
     Surroundings,
     associate,
     associate_one_camera,
-    without_common_errors,
 )
-from pipelines.keypoints.bodies import SightLines, find_bodies
+from pipelines.keypoints.bodies import SightLines
 from pipelines.keypoints.corrections import Pair, mirrored_pairs, swaps_across_views
 from pipelines.reconstruction.observations import on_sides
 from pipelines.simulation.detector_errors import see
@@ -408,40 +407,6 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
 
 
 BESIDE = straight((-3.0, 1.5), (1.0, 0.0))
-
-
-def disagreement(scene: Scene, views: SightLines, person: int) -> float:
-    """Compute the root mean square, in sigma of the scene, of a person's rays about their nearest points."""
-    squares = []
-    for t in range(0, len(scene.time_s), 10):
-        rays, origins = [], []
-        for c in range(scene.xy.shape[1]):
-            (d,) = np.flatnonzero(scene.who[t, c] == person)
-            ray = np.c_[views.xy[t, c, d], np.ones(views.xy.shape[3])] @ views.rotation[t, c].T
-            rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-            origins.append(np.broadcast_to(views.position[t, c], ray.shape))
-        across = np.eye(3) - np.einsum("cji,cjk->cjik", rays, rays)
-        target = np.einsum("cjik,cjk->ji", across, np.array(origins))
-        points = np.linalg.solve(across.sum(axis=0), target[..., None])[..., 0]
-        off = np.einsum("cjik,cjk->cji", across, points - np.array(origins))
-        away = np.linalg.norm(points - np.array(origins), axis=-1)
-        squares.append((np.linalg.norm(off, axis=-1) / away / scene.sigma[0, 0]) ** 2)
-    return float(np.sqrt(np.mean(squares)))
-
-
-def test_the_views_of_others_agree_without_the_errors_that_the_first_person_shows() -> None:
-    """Turn each of three cameras by 1 degree, which moves everybody in a picture by about the same.
-
-    What is left is the keypoints' noise (0.11 sigma) and the turn about the optical axis (0.15 sigma at 1.5 m
-    from the middle of the picture).
-    """
-    scene = film([ACTOR, BESIDE], cameras=3, bias=(0.0, 1.0), seed=3)
-    views = SightLines(scene.xy, scene.confidence, scene.position, scene.rotation, scene.sigma)
-    seen = find_bodies(scene.time_s, views)
-    corrected = without_common_errors(scene.time_s, views, seen)
-    assert disagreement(scene, views, 1) > 1.0
-    assert disagreement(scene, corrected, 1) < np.hypot(0.11, 0.15) * 1.1
-    assert (corrected.sigma < views.sigma).all()
 
 
 def test_people_are_told_apart_under_constant_pose_errors() -> None:

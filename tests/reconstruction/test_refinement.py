@@ -34,7 +34,7 @@ from pipelines.reconstruction.refinement.refine import (
     refine,
 )
 from pipelines.reconstruction.refinement.system import Knowledge, System, build, lay_out, misfit, prior_cost
-from tests.reconstruction.formations import BONES, Formation, formation, mean_mm
+from tests.reconstruction.formations import BONES, STATED_PX, Formation, formation, mean_mm
 
 WHITE = White(position_m=0.3, rotation_deg=1.0)
 BIAS = Bias(position_m=0.3, rotation_deg=1.0)
@@ -245,6 +245,15 @@ def test_it_is_ahead_of_the_best_peer_at_true_poses(share: float, most_mm: float
     assert np.isfinite(position).all()
 
 
+def test_two_hovering_cameras_do_not_run_away_with_the_size() -> None:
+    """Limit the body's size in learning: without a limit it halved in a step, with 1.8 times the error."""
+    flight = formation(60, 2, [BIAS], 8, still=True, tilt_deg=45.0)
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, [pose_errors([BIAS])] * 2, np.zeros(2))
+    assert result.fallback is None
+    assert result.levels["pixel_scale"] < 1.15 * 2.0 / STATED_PX  # of 2 px keypoints
+    assert mean_mm(result.position, flight.truth) < mean_mm(flight.start, flight.truth)
+
+
 @pytest.mark.parametrize("exact", [True, False])
 def test_assumed_constant_errors_are_no_larger_than_the_views_disagree(exact: bool) -> None:
     """Give hovering cameras assumed levels, and a detector with lasting errors of 3 px (20 mm at 10 m).
@@ -284,6 +293,24 @@ def test_constant_errors_that_nothing_determines_are_held_and_all_else_is_estima
     off = np.nanmedian(result.position - flight.start, axis=(0, 1))
     np.testing.assert_allclose(off, 0, atol=0.02)  # its median is over what was filled in between, too
     assert np.diagonal(result.covariance, axis1=2, axis2=3).min() > 4.5 / 2 / 3 * 0.1**2
+
+
+def test_a_place_that_nobody_saw_is_the_log_s() -> None:
+    # Two cameras with drifting logs and no stated noise: the estimated levels put the person a metre off.
+    models: list[NoiseModel] = [BIAS, Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)]
+    flight = formation(60, 2, models, 3, still=True)
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, None, np.zeros(2))
+    assert result.fallback is None
+    assert result.warnings[0] == PLACED_AS_LOGGED
+    off = np.nanmedian(result.position - flight.start, axis=(0, 1))
+    # Its median is over what was filled in between, too.
+    np.testing.assert_allclose(off, 0, atol=0.01)
+    # Pictures stay as they were explained: cameras moved with the skeleton.
+    _, numbers = result.corrections[0]
+    position, rotation = corrected(flight.sightings[0].position, flight.sightings[0].rotation, numbers)
+    seen = np.einsum("tij,tki->tkj", rotation, result.position - position[:, None])
+    miss_px = 1500 * np.abs(seen[..., :2] / seen[..., 2:] - flight.sightings[0].rays)
+    assert np.median(miss_px) < 2.0  # keypoints err by 2 px: 1.35 of it in the median
 
 
 def test_a_wrong_prior_is_noticed() -> None:

@@ -84,9 +84,8 @@ class Alternative:
     scene: SceneOfMoments | None = None  # None of what is seen directly
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
-    alike: Callable[[], tuple[SceneOfMoments, Sampled]] | None = (
-        None  # times of all cameras, by the same pictures
-    )
+    # Of times of all cameras: the scene of the same pictures, at the moments of the flight beside it.
+    same_pictures: Callable[[], tuple[SceneOfMoments, Sampled]] | None = None
     flight: Sampled | None = None  # where a map and an actor are other than described
 
 
@@ -186,7 +185,7 @@ def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> A
         remedies.frame_rate(trial.cameras, group, factor),
         price,
         trial.with_times(group, slower=factor),
-        alike=partial(trial.with_all_times, 0.0, factor) if alike else None,
+        same_pictures=partial(trial.with_all_times, 0.0, factor) if alike else None,
     )
 
 
@@ -211,7 +210,7 @@ def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
         remedies.clock(trial.cameras, group, late_s),
         1.0 + abs(late_s) / 2,
         trial.with_times(group, late_s),
-        alike=partial(trial.with_all_times, late_s) if alike else None,
+        same_pictures=partial(trial.with_all_times, late_s) if alike else None,
     )
 
 

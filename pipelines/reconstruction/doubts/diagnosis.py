@@ -331,7 +331,7 @@ class Tried(NamedTuple):
         by_score, by_rays = np.subtract(self.before, self.after)
         if self.alternative.code in TIMES:
             is_scored = by_score >= LEAST_GAIN_OF_TIMES
-            least = -_ALIKE if is_scored and not self.alternative.alike else MARGIN
+            least = -_ALIKE if is_scored and self.alternative.same_pictures is None else MARGIN
         else:
             least = -np.inf if odd else MARGIN
         # Whoever is far too tall or small is doubted anyway.
@@ -490,14 +490,14 @@ class Objective:
             before = min(self._fit(same).cost, self._cost_of_pictures(scene))
             total = min(total, score(self.trial.flight, same, self.base).total)
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
-        if tried.alternative.alike is not None:
-            of_poses, flight = tried.alternative.alike()
+        if tried.alternative.same_pictures is not None:
+            of_poses, flight = tried.alternative.same_pictures()
             saved = self._fit(self._at_moments_of(of_poses)).cost - self._fit(of_poses, flight).cost
             cost = max(cost, before - saved) if np.isfinite(saved) else np.inf
         if tried.alternative.code in TIMES:
             others = [self.trial.names.index(name) for name in tried.alternative.cameras]
             # Few rates of one camera are tried, and its rays must go on meeting those of the others.
-            one_rate = tried.alternative.code == "frame_rate" and tried.alternative.alike is None
+            one_rate = tried.alternative.code == "frame_rate" and tried.alternative.same_pictures is None
             chance = (1.0 if one_rate else _MOST_BY_CHANCE) * self._chance(before, others)
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)

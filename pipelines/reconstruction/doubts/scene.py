@@ -80,11 +80,6 @@ class Sampled(NamedTuple):
     actor: LoggedActor | None = None
     truth_m: float | None = None  # stature of the true joints, if there are any
 
-    @property
-    def step_s(self) -> float:
-        """Time between the two moments of a pair."""
-        return float(self.t_ns[self.second[0]] - self.t_ns[self.first[0]]) / 1e9
-
     def at_other_times(self, late_s: float, slower: float) -> Sampled:
         """Move the moments to where the first camera shows the same pictures, if all times are so wrong."""
         first_ns = self.cameras[0].entry.frames.first_t_ns
@@ -539,7 +534,7 @@ class Body:
             white_m: by how much pose errors that are new in every pose move the person.
             keypoint_m: by how much keypoints' errors move a joint.
         """
-        step_s = flight.step_s
+        step_s = STEP_NS / 1e9
         noise = np.sqrt(2) * white_m / step_s  # m/s
         moved = (self.hips[flight.second] - self.hips[flight.first]) / step_s
         pace = np.linalg.norm(moved[:, :2], axis=-1)
@@ -576,8 +571,8 @@ class Body:
                 for name in ("left_ankle", "right_ankle")
             )
         )
-        pace, legs = way_m / way_s, way_m / way_s - left_m / flight.step_s
-        known = np.isfinite(legs) & (pace > _LEAST_TREAD_MPS) & (way_s > 3 * flight.step_s)
+        pace, legs = way_m / way_s, way_m / way_s - left_m / (STEP_NS / 1e9)
+        known = np.isfinite(legs) & (pace > _LEAST_TREAD_MPS) & (way_s > 3 * STEP_NS / 1e9)
         if known.sum() < _FEWEST_TREADS:
             return Oddity(0.0, {})
         walked = float(pace[known].mean())

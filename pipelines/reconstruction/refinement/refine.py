@@ -93,6 +93,8 @@ _FARTHEST_STATED = 3.2
 sqrt(30.7 / 3): the root of a chi-square variable with three degrees of freedom over three exceeds it once in
 a million times.
 """
+_DETERMINED_PLACE = 0.7
+"""Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
 PLACED_AS_LOGGED = (
     "refined: the videos do not determine the person's absolute position; it is taken from the logged poses "
@@ -216,6 +218,8 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
+    assumed = any(errors.assumed for errors in known.poses)
+    as_logged = prior.learned and not assumed and _position_undetermined(system, state, at, covariance)
     del at  # the next solutions have their own factors
     slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
@@ -232,7 +236,7 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
         fallback = (
             f"the skeleton would move by {moved_m:.2f} m where the views let expect {prior.expected_m:.2f} m"
         )
-    as_logged = prior.held_m > 0
+    as_logged = as_logged or prior.held_m > 0
     shift = np.median(views.start - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     return Refined(
         position=joints + shift,
@@ -626,6 +630,25 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
         if surprise > _SIGMAS and not at_knots:
             return f"camera {camera + 1} would be {surprise:.0f} standard deviations from its logged poses"
     return None
+
+
+def _position_undetermined(system: System, state: State, at: Eliminated, covariance: Float) -> bool:
+    """Test if the person's absolute position is not determined by the pictures.
+
+    Constant errors are only a few numbers, and their estimated levels are uncertain. If the posterior of the
+    position is almost as wide as these levels allow, or the scale is not determined, the estimated position
+    is a random draw from the levels, and no nearer to the truth than the logged one.
+    """
+    _, distance = _residuals(system.problem, state.position)
+    range_m = float(np.nanmedian(distance))
+    poses = system.knowledge.poses
+    slow_m = float(np.mean([_ray_sigma_m(replace(errors, white=(0.0, 0.0)), range_m) for errors in poses]))
+    white_m = float(np.mean([_ray_sigma_m(replace(errors, processes=()), range_m) for errors in poses]))
+    if slow_m <= white_m:
+        return False
+    left_m = float(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean()))
+    unseen = _scale_left(system, state, at) > _UNSEEN_SCALE
+    return unseen or left_m > _DETERMINED_PLACE * slow_m * _spread_of(len(poses))
 
 
 def _scale_unseen(system: System, state: State, at: Eliminated) -> bool:
