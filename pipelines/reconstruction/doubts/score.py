@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Index, Int64, known_median
+from pipelines.geometry.arrays import Bool, Float, Int64, known_median
+from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.geometry.triangulation import MIN_PARALLAX_DEG
 from pipelines.reconstruction.doubts.scene import (
@@ -57,8 +58,6 @@ _HUBER = 1.5
 _USUAL_M = 10.0
 # With fewer rays nothing can be fitted.
 _FEWEST_RAYS = 60
-# A vector times this has the products of the three axes with it as columns, one row after the other.
-_CROSS = np.array([np.cross(np.eye(3), axis).T.ravel() for axis in np.eye(3)])
 
 Make = Callable[[Float], SceneOfMoments]
 """A scene from the numbers [n] of an alternative."""
@@ -92,32 +91,75 @@ def solve(scene: SceneOfMoments) -> SolvedJoints:
     """Triangulate by least squares of distances to rays, weighted by what keypoints and poses err by."""
     direction = _directions(scene)
     seen: Bool = np.isfinite(direction[..., 0] + scene.position.sum(axis=-1)[..., None])
-    direction = np.where(seen[..., None], direction, 0.0)
-    ray = np.ascontiguousarray(np.moveaxis(direction, -1, 0))
-    centre = np.moveaxis(np.nan_to_num(scene.position), -1, 0)[..., None]
-    off = centre - ray * (ray * centre).sum(axis=0)  # of each line from the origin
+    direction, centre = np.where(seen[..., None], direction, 0.0), np.nan_to_num(scene.position)
     angle2 = pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2
-    joints, chi2, depth = off[:, 0], off[0, 0], np.full(seen.shape, _FIRST_M)
-    for _ in range(2):
-        far2 = np.clip(np.abs(depth), _NEAREST_M, _FARTHEST_RAY_M) ** 2
-        weight = seen / (far2 * angle2[:, None, None] + scene.sigma[:, 0, None, None] ** 2)
-        matrix = -((weight * ray)[:, None] * ray).sum(axis=2)
-        matrix[range(3), range(3)] += weight.sum(axis=0) * (1 + _FIRM) + 1e-30
-        joints = (_inverse(matrix) * (weight * off).sum(axis=1)).sum(axis=1)
-        toward = joints[:, None] - centre
-        depth = (toward * ray).sum(axis=0)
-        chi2 = (weight * ((toward - depth * ray) ** 2).sum(axis=0)).sum(axis=0)
-    depth, views = np.where(seen, depth, 0.0), seen.sum(axis=0)
-    joints = np.where(views < 2, np.nan, joints).transpose(1, 2, 0)
+    views = seen.sum(axis=0)
+    joints, chi2, depth = _meet(direction, centre, seen, angle2, scene.sigma[:, 0] ** 2)
+    joints[views < 2] = np.nan
     in_front: Bool = np.asarray(((depth > 0) | ~seen).all(axis=0))
     return SolvedJoints(joints, chi2, views, in_front, direction, seen, depth)
 
 
+@helper
 def _inverse(matrix: Float) -> Float:
-    """Invert symmetric matrices [3, 3, ...] by their cofactors."""
-    one, other = [1, 2, 0], [2, 0, 1]
-    cofactors = matrix[one][:, one] * matrix[other][:, other] - matrix[one][:, other] * matrix[other][:, one]
-    return np.asarray(cofactors / (matrix[0] * cofactors[0]).sum(axis=0))
+    """Invert a symmetric matrix [3, 3] by its cofactors."""
+    inverse = np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            j, m, n, o = (i + 1) % 3, (i + 2) % 3, (k + 1) % 3, (k + 2) % 3
+            inverse[i, k] = matrix[j, n] * matrix[m, o] - matrix[j, o] * matrix[m, n]
+    determinant = 0.0
+    for k in range(3):
+        determinant += matrix[0, k] * inverse[0, k]
+    for i in range(3):
+        for k in range(3):
+            inverse[i, k] /= determinant
+    return inverse
+
+
+@cached
+def _meet(
+    direction: Float, centre: Float, seen: Bool, angle2: Float, place2: Float
+) -> tuple[Float, Float, Float]:
+    """Return the joints [T, J, 3] nearest to rays, their chi^2 [T, J] and depths [C, T, J]; 0 if unseen."""
+    cameras, times, names = seen.shape
+    joints, chi2, depth = np.zeros((times, names, 3)), np.zeros((times, names)), np.zeros(seen.shape)
+    matrix, right, weight = np.empty((3, 3)), np.empty(3), np.empty(cameras)
+    for at in range(2 * times * names):
+        second, t, j = at % 2, at // 2 // names, at // 2 % names
+        for i in range(3):
+            right[i] = 0.0
+            for k in range(3):
+                matrix[i, k] = 0.0
+        for c in range(cameras):
+            if not seen[c, t, j]:
+                continue
+            ray, along = direction[c, t, j], 0.0
+            away = min(max(abs(depth[c, t, j]), _NEAREST_M), _FARTHEST_RAY_M) if second else _FIRST_M
+            weight[c] = 1 / (away**2 * angle2[c] + place2[c])
+            for i in range(3):
+                along += ray[i] * centre[c, t, i]
+            for i in range(3):
+                right[i] += weight[c] * (centre[c, t, i] - ray[i] * along)
+                matrix[i, i] += weight[c] * (1 + _FIRM) + 1e-30
+                for k in range(3):
+                    matrix[i, k] -= weight[c] * ray[i] * ray[k]
+        if matrix[0, 0] == 0.0:
+            continue
+        inverse = _inverse(matrix)
+        for i in range(3):
+            joints[t, j, i] = inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
+        chi2[t, j] = 0.0
+        for c in range(cameras):
+            if not seen[c, t, j]:
+                continue
+            ray, along = direction[c, t, j], 0.0
+            for i in range(3):
+                along += (joints[t, j, i] - centre[c, t, i]) * ray[i]
+            depth[c, t, j] = along
+            for i in range(3):
+                chi2[t, j] += weight[c] * (joints[t, j, i] - centre[c, t, i] - along * ray[i]) ** 2
+    return joints, chi2, depth
 
 
 @dataclass(frozen=True)
@@ -171,46 +213,85 @@ def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Fl
     return (toward - along[..., None] * direction) / far[..., None], far
 
 
-def _by_errors(joints: Float, position: Float, direction: Float, missed: Float) -> Float:
-    """Return the derivatives [C, T, J, 3, 6] of misses by each camera's shift and turn.
+@cached
+def _linear(
+    joints: Float,
+    position: Float,
+    direction: Float,
+    root: Float,
+    kept: Float,
+    numbers: Float,
+    placed: Float,
+    pull: Float,
+) -> tuple[Float, Float, Float]:
+    """Linearise the misses of rays, and solve for the joints.
 
-    Misses shrink with distance, and so do the parts of their standard deviations that come from places:
-    `missed` [C, T, J, 3] is the misses times the share of the variance that does not shrink.
-    """
-    toward = joints - position[:, :, None]
-    along = (toward * direction).sum(axis=-1)
-    far = np.maximum(np.abs(along), _NEAR_M)[..., None, None]
-    leaning = direction + missed * np.where(np.abs(along) > _NEAR_M, np.sign(along), 0.0)[..., None]
-    shifted = leaning[..., None] * direction[..., None, :] - np.eye(3)
-    turned = along[..., None, None] * (direction @ _CROSS).reshape(*direction.shape, 3)
-    turned += leaning[..., None] * np.cross(direction, toward)[..., None, :]
-    return np.concatenate([shifted / far, -turned / far], axis=-1)
-
-
-def _normal_equations(rows: Float, placed: Float, pull: Float) -> tuple[Float, Float]:
-    """Make the equations of constant errors and numbers, with the joints eliminated.
+    Misses shrink with distance, and so do the parts of their standard deviations that come from places.
 
     Args:
-        rows: [C, T, J, 3, 6 + n + 1] weighted derivatives of the misses by each camera's shift and turn, by
-            the n numbers, and the misses.
+        joints: [T, J, 3].
+        position: [C, T, 3] of the cameras.
+        direction: [C, T, J, 3] unit rays.
+        root: [C, T, J] roots of weights.
+        kept: [C, T, J] share of a miss's variance that does not shrink.
+        numbers: [C, T, J, 3, n + 1] derivatives of the misses by the n numbers, and the misses.
         placed: [T, J] weights of known places.
         pull: [T, J, 3] towards these.
 
-    Return normal matrix and right side [6 C + n, 6 C + n + 1], and by how much each unknown moves the joints
-    [T, J, 3, 6 C + n].
+    Return weighted derivatives [C, 3 T J, 6 + n + 1] by each camera's shift and turn, by the numbers, and the
+    misses; those by the joints times these [3 T J, 6 C + n + 1]; and this with the joints solved.
     """
-    mixed = -rows[..., :3].mT @ rows  # a joint moves as the camera does, the other way
-    # Each camera has its own errors; the numbers are shared by all.
-    both = np.concatenate([*mixed[..., :6], mixed[..., 6:].sum(axis=0)], axis=-1)
-    both[..., -1] -= pull
-    matrix = (placed + _FIRM)[..., None, None] * np.eye(3) - mixed[..., :3].sum(axis=0)
-    solution = np.moveaxis(_inverse(np.moveaxis(matrix, (-2, -1), (0, 1))), (0, 1), (-2, -1)) @ both
-    width = both.shape[-1]
-    equations = -both.reshape(-1, width).T @ solution.reshape(-1, width)
-    for camera, own in enumerate(rows.reshape(len(rows), -1, rows.shape[-1])):
-        place = [*range(6 * camera, 6 * camera + 6), *range(6 * len(rows), width)]
-        equations[np.ix_(place, place)] += own.T @ own
-    return equations[:-1], solution[..., :-1]
+    cameras, times, names = root.shape
+    count = numbers.shape[4]
+    width = 6 * cameras + count
+    rows = np.zeros((cameras, 3 * times * names, 6 + count))
+    both, solution = np.zeros((3 * times * names, width)), np.zeros((3 * times * names, width))
+    matrix, toward = np.empty((3, 3)), np.empty(3)
+    for at in range(times * names):
+        t, j, first = at // names, at % names, 3 * at
+        for i in range(3):
+            for k in range(3):
+                matrix[i, k] = 0.0
+            matrix[i, i] = placed[t, j] + _FIRM
+            both[first + i, width - 1] = -pull[t, j, i]
+        for c in range(cameras):
+            weight = root[c, t, j]
+            if weight == 0.0:
+                continue
+            ray, along = direction[c, t, j], 0.0
+            for i in range(3):
+                toward[i] = joints[t, j, i] - position[c, t, i]
+                along += toward[i] * ray[i]
+            far = max(abs(along), _NEAR_M)
+            farther = np.sign(along) * kept[c, t, j] if abs(along) > _NEAR_M else 0.0
+            for i in range(3):
+                row = rows[c, first + i]
+                leaning = ray[i] + farther * numbers[c, t, j, i, count - 1]
+                for k in range(3):
+                    row[k] = weight * (leaning * ray[k] - (i == k)) / far
+                    # The ray turns about axis k, by the product of that with the ray.
+                    one, other = (k + 1) % 3, (k + 2) % 3
+                    turned = (i == other) * ray[one] - (i == one) * ray[other]
+                    nearer = ray[one] * toward[other] - ray[other] * toward[one]
+                    row[3 + k] = -weight * (along * turned + leaning * nearer) / far
+                for k in range(count):
+                    row[6 + k] = weight * numbers[c, t, j, i, k]
+            # A joint moves as the camera does, the other way.
+            for m in range(3):
+                row = rows[c, first + m]
+                for i in range(3):
+                    for k in range(3):
+                        matrix[i, k] += row[i] * row[k]
+                    for k in range(6):
+                        both[first + i, 6 * c + k] -= row[i] * row[k]
+                    for k in range(count):
+                        both[first + i, 6 * cameras + k] -= row[i] * row[6 + k]
+        inverse = _inverse(matrix)
+        for i in range(3):
+            for m in range(3):
+                for k in range(width):
+                    solution[first + i, k] += inverse[i, m] * both[first + m, k]
+    return rows, both, solution
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -246,21 +327,28 @@ def _step(
     cost = float((np.where(used, huber, 0.0) / seen).sum()) + strain
 
     # Farther away, errors of places are smaller angles: the misses and their standard deviations alike.
-    parts = [_by_errors(joints, place, solved.direction, missed * (turned2 / variance)[..., None])]
+    parts = []
     for probe in _PROBE * np.eye(len(numbers)):
         probed = _with_errors(make(numbers + probe), errors)
         ray = np.where(used[..., None], _directions(probed), 0.0)
         moved, away = _misses(joints, np.nan_to_num(probed.position), ray)
         moved *= np.sqrt(variance / (turned2 + moved2 / away**2))[..., None]
-        parts.append((moved - missed)[..., None] / _PROBE)
-    rows = np.concatenate([*parts, missed[..., None]], axis=-1) * np.sqrt(weight)[..., None, None]
-    equations, moved = _normal_equations(rows, placed, pull)
+        parts.append((moved - missed) / _PROBE)
+    by_numbers = np.stack([*parts, missed], axis=-1)
+    rows, both, solution = _linear(
+        joints, place, solved.direction, np.sqrt(weight), turned2 / variance, by_numbers, placed, pull
+    )
+    # Each camera has its own errors; the numbers are shared by all.
+    equations = -both.T @ solution
+    for camera, own in enumerate(rows):
+        place_of = [*range(6 * camera, 6 * camera + 6), *range(errors.size, unknowns + 1)]
+        equations[np.ix_(place_of, place_of)] += own.T @ own
     # The person grows by what moves the joints away from their middle at each moment.
     known = np.isfinite(solved.joints).all(axis=2, keepdims=True)
     middle = joints.sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
-    about = np.where(known, joints - middle, 0.0)
-    of_size = -np.tensordot(about, moved, 3) / (max(float((about**2).sum()), 1e-9) * SIZE_SIGMA)
-    normal, right = equations[:, :-1], equations[:, -1]
+    about = np.where(known, joints - middle, 0.0).ravel()
+    of_size = -(about @ solution[:, :-1]) / (max(float(about @ about), 1e-9) * SIZE_SIGMA)
+    normal, right = equations[:-1, :-1], equations[:-1, -1]
     free = np.asarray(loose, dtype=np.float64)
     inverse = np.concatenate([1 / sigma.ravel() ** 2, 1 / free**2])
     normal += np.diag(inverse + 1e-9) + np.outer(of_size, of_size)
@@ -451,8 +539,16 @@ def _rays(solved: SolvedJoints, good: Bool, misfit: float) -> dict[str, Oddity]:
 
 def _scatter(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
     """Fit constant errors of two poses to the rays' distances, and measure what they leave over the noise."""
-    shape = solved.seen.shape[1:]
-    used, design, apart, noise2 = _crossings(scene, solved, pair)
+    shape, two = solved.seen.shape[1:], list(pair)
+    used, design, apart, noise2 = _crossings(
+        solved.direction[two],
+        solved.depth[two],
+        solved.seen[two],
+        scene.position[two],
+        scene.rotation[two],
+        scene.sigma[two],
+        (pixel_variance(scene) / scene.focal_px**2)[two],
+    )
     if len(used) < _FEWEST:
         return None
     noise = np.sqrt(median(noise2))
@@ -468,32 +564,45 @@ def _scatter(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int])
     return float(1.48 * median(np.abs(residual - known_median(residual, 1)[:, None])) / noise)
 
 
+@cached
 def _crossings(
-    scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]
-) -> tuple[Index, Float, Float, Float]:
-    """Compare the rays of two cameras along their common normals.
+    ray: Float, depth: Float, seen: Bool, place: Float, rotation: Float, sigma: Float, pixel2: Float
+) -> tuple[Int64, Float, Float, Float]:
+    """Compare the rays [2, T, J, 3] of two cameras along their common normals.
 
     That distance changes by the normal with a shift of a camera, and by the lever (distance times ray) across
-    the normal with a turn. Return indices [N] of joints whose rays cross; the derivatives [N, 12] of their
-    distances by shift and turn of each camera, in standard deviations; the distances [N] m and their
-    variances [N] m^2.
+    the normal with a turn; `pixel2` [2] rad^2 are variances of keypoints. Return indices [N] of joints whose
+    rays cross; the derivatives [N, 12] of their distances by shift and turn of each camera, in standard
+    deviations; the distances [N] m and their variances [N] m^2.
     """
-    normal = np.cross(solved.direction[pair[0]], solved.direction[pair[1]])
-    sine = np.linalg.norm(normal, axis=-1)
-    used = np.nonzero(solved.seen[list(pair)].all(axis=0) & (sine > _PARALLEL))
-    normal = normal[used] / sine[used][:, None]
-    between = scene.position[pair[1]] - scene.position[pair[0]]
-    parts, noise2 = [], np.zeros(len(normal))
-    for camera, sign in zip(pair, (-1, 1), strict=True):
-        away = np.clip(np.abs(solved.depth[camera][used]), 1e-4, 1e5)
-        lever = np.cross(solved.direction[camera][used], normal)[:, None] @ scene.rotation[camera, used[0]]
-        place, turn, new_place, new_turn = scene.sigma[camera, :4]
-        parts += [sign * place * normal, sign * turn * away[:, None] * lever[:, 0]]
-        noise2 += away**2 * pixel_variance(scene)[camera] / scene.focal_px[camera] ** 2
-        # What is new in every pose turns the person in the picture, besides moving them.
-        noise2 += (_HALF_BODY_M * new_turn) ** 2 + (_HALF_BODY_M * new_place / np.maximum(away, 1.0)) ** 2
-    apart = (between[used[0]] * normal).sum(axis=-1)
-    return np.ravel_multi_index(used, sine.shape), np.hstack(parts), apart, noise2
+    _, times, names = seen.shape
+    used, design = np.empty(times * names, np.int64), np.zeros((times * names, 12))
+    apart, noise2, normal, n = np.zeros(times * names), np.zeros(times * names), np.empty(3), 0
+    for at in range(times * names):
+        t, j = at // names, at % names
+        a, b, length2 = ray[0, t, j], ray[1, t, j], 0.0
+        for i in range(3):
+            normal[i] = a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]
+            length2 += normal[i] ** 2
+        if not (seen[0, t, j] and seen[1, t, j] and length2 > _PARALLEL**2):
+            continue
+        used[n] = at
+        for i in range(3):
+            normal[i] /= np.sqrt(length2)
+            apart[n] += normal[i] * (place[1, t, i] - place[0, t, i])
+        for c in range(2):
+            sign, away = 2 * c - 1, min(max(abs(depth[c, t, j]), 1e-4), 1e5)
+            for i in range(3):
+                one, other = (i + 1) % 3, (i + 2) % 3
+                lever = ray[c, t, j, one] * normal[other] - ray[c, t, j, other] * normal[one]
+                design[n, 6 * c + i] = sign * sigma[c, 0] * normal[i]
+                for k in range(3):
+                    design[n, 6 * c + 3 + k] += sign * sigma[c, 1] * away * lever * rotation[c, t, i, k]
+            # What is new in every pose turns the person in the picture, besides moving them.
+            turned, moved = _HALF_BODY_M * sigma[c, 3], _HALF_BODY_M * sigma[c, 2] / max(away, 1.0)
+            noise2[n] += away**2 * pixel2[c] + turned**2 + moved**2
+        n += 1
+    return used[:n], design[:n], apart[:n], noise2[:n]
 
 
 def _place(
