@@ -336,12 +336,15 @@ def _depths(inside: NDArray[np.bool_], resolution_m: float) -> NDArray[np.float3
                 steps = min(steps + 1, far) if inside[i, j, k] else 0
                 squares[i, j, k] = min(steps, squares[i, j, k]) ** 2
         for k in range(size[2]):
-            line[: size[1]] = squares[i, :, k]
+            for j in range(size[1]):
+                line[j] = squares[i, j, k]
             _lower_envelope(line[: size[1]], places, crossing)
-            squares[i, :, k] = line[: size[1]]
+            for j in range(size[1]):
+                squares[i, j, k] = line[j]
     for j in range(size[1]):
         for k in range(size[2]):
-            line[: size[0]] = squares[:, j, k]
+            for i in range(size[0]):
+                line[i] = squares[i, j, k]
             _lower_envelope(line[: size[0]], places, crossing)
             for i in range(size[0]):
                 if inside[i, j, k]:

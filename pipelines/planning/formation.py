@@ -241,7 +241,12 @@ def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
 def _first_step(lattice: Lattice, start: Float) -> tuple[Bool, Float]:
     """Test which states [S] can follow slots anywhere between the states; return the time to each, too."""
     states = lattice.states.shape[0]
-    reach_s, way_s = np.zeros(states), np.zeros(states)
+    within, reach_s, way_s, nearest_s = (
+        np.zeros(states, np.bool_),
+        np.zeros(states),
+        np.zeros(states),
+        math.inf,
+    )
     for s in range(states):
         for axis in range(3):
             way = abs(lattice.states[s, axis] - start[axis])
@@ -249,14 +254,19 @@ def _first_step(lattice: Lattice, start: Float) -> tuple[Bool, Float]:
                 way = abs(_wrapped(way))
             reach_s[s] = max(reach_s[s], way / lattice.rates[axis])
             way_s[s] += way / lattice.rates[axis]
-    return reach_s <= max(lattice.knot_s, reach_s.min()) + REACH_MARGIN_S, way_s
+        nearest_s = min(nearest_s, reach_s[s])
+    for s in range(states):
+        within[s] = reach_s[s] <= max(lattice.knot_s, nearest_s) + REACH_MARGIN_S
+    return within, way_s
 
 
 @helper
 def _reached(lattice: Lattice, start: Float, times: int) -> Bool:
     """Test which states a sequence can be in at each time, [T, S]."""
     reached = np.zeros((times, lattice.states.shape[0]), np.bool_)
-    reached[0] = _first_step(lattice, start)[0]
+    within = _first_step(lattice, start)[0]
+    for s in range(within.shape[0]):
+        reached[0, s] = within[s]
     for t in range(times - 1):
         for s in range(reached.shape[1]):
             if reached[t, s]:
@@ -412,7 +422,6 @@ def _cheapest_formation(
     return team
 
 
-@cached
 def best_teams(
     price: Float, free: Float, views: TeamViews, w: TeamWeights, commanded: Float, before: Int64
 ) -> Int64:
@@ -424,27 +433,40 @@ def best_teams(
     the error left out (at the tilt and range that are asked for), and from nothing: the drone with the
     dearest slots chooses first.
     """
+    drones, times = before.shape
+    dear = price[np.arange(times), before].cumsum(axis=1)[:, -1]
+    orders = np.stack([np.arange(drones), np.argsort(-dear, kind="stable")])
+    level = price + np.where(views.as_asked, 0.0, TOO_NEAR)
+    teams = np.full((5, drones, times), -1)
+    teams[0] = before
+    costs = _improve_teams(price, level, free, views, w, commanded, orders, teams)
+    return np.asarray(teams[np.argsort(costs, kind="stable")])
+
+
+@cached
+def _improve_teams(
+    price: Float,
+    level: Float,
+    free: Float,
+    views: TeamViews,
+    w: TeamWeights,
+    commanded: Float,
+    orders: Int64,
+    teams: Int64,
+) -> Float:
+    """Fill and improve teams [5, n, T] in place, the last one in the second order; return their costs [5]."""
     formation = _cheapest_formation(price, free, views, w, commanded)
     plain = _cheapest_formation(price, free, views, TeamWeights(0.0, w.prior, w.apart_m), commanded)
-    drones, times = before.shape
-    dear = np.zeros(drones)
-    for i in range(drones):
-        for t in range(times):
-            dear[i] += price[t, before[i, t]]
-    in_turn, dearest_first = np.arange(drones), np.argsort(-dear, kind="mergesort")
-    teams = np.empty((5, drones, times), np.int64)
-    teams[0], teams[1], teams[2], teams[3], teams[4] = before, formation, plain, formation, -1
-    level = price.copy()
-    for s in range(price.shape[1]):
-        if not views.as_asked[s]:
-            level[:, s] += TOO_NEAR
-    for k in range(3):
-        _improve_team(level if k == 2 else price, free, views, w, commanded, in_turn, teams[k])
-    _improve_team(price, free, views, w, commanded, dearest_first, teams[4])
+    for i in range(teams.shape[1]):
+        for t in range(teams.shape[2]):
+            teams[1, i, t] = teams[3, i, t] = formation[i, t]
+            teams[2, i, t] = plain[i, t]
     costs = np.empty(teams.shape[0])
     for k in range(teams.shape[0]):
+        if k != 3:
+            _improve_team(level if k == 2 else price, free, views, w, commanded, orders[k // 4], teams[k])
         costs[k] = _team_cost(price, free, views, w, commanded, teams[k])
-    return teams[np.argsort(costs, kind="mergesort")]
+    return costs
 
 
 @helper

@@ -167,6 +167,14 @@ def _fly(wanted: Float, flying: Flying, state: Float, following: Float, scratch:
     return shortened
 
 
+@helper
+def _copy_state(source: Float, into: Float) -> None:
+    """Copy a state; assignments to slices would take seconds to compile."""
+    for row in range(source.shape[0]):
+        for axis in range(3):
+            into[row, axis] = source[row, axis]
+
+
 @cached
 def roll_out(
     path: Float,
@@ -183,7 +191,7 @@ def roll_out(
     last = states.shape[0] - 1
     for k in range(last):
         state, following = states[k], states[k + 1]
-        following[:] = state
+        _copy_state(state, following)
         if k < ticks:
             _reference(path, start_velocity, step_s, after_s + k * flying.period_s, x, v, a)
             for axis in range(3):
@@ -197,7 +205,8 @@ def roll_out(
                 )
             # Anti-windup: the integral stops while a limit holds.
             if _fly(wanted, flying, state, following, scratch):
-                following[INTEGRAL] = state[INTEGRAL]
+                for axis in range(3):
+                    following[INTEGRAL, axis] = state[INTEGRAL, axis]
             continue
         square = 0.0
         for axis in range(3):
@@ -207,10 +216,10 @@ def roll_out(
             following[INTEGRAL, axis] = 0.0
             square += following[VELOCITY, axis] ** 2
         if square < STOPPED_MPS**2:
-            following[VELOCITY] = 0.0
-            following[ACCELERATION] = 0.0
+            for axis in range(3):
+                following[VELOCITY, axis] = following[ACCELERATION, axis] = 0.0
             for rest in range(k + 2, last + 1):
-                states[rest] = following
+                _copy_state(following, states[rest])
             return k + 1
     return int(last)
 
