@@ -272,7 +272,8 @@ def _clipped(points: Float, faces: Int32, pinhole: Float, width: float, height: 
         for k in range(3):
             here, there = points[faces[f, k]], points[faces[f, (k + 1) % 3]]
             if here[2] >= NEAR_M:
-                polygon[size] = here
+                for axis in range(3):
+                    polygon[size, axis] = here[axis]
                 size += 1
             if (here[2] >= NEAR_M) != (there[2] >= NEAR_M):
                 share = (NEAR_M - here[2]) / (there[2] - here[2])
@@ -291,9 +292,10 @@ def _clipped(points: Float, faces: Int32, pinhole: Float, width: float, height: 
         if right < -0.5 or left > width - 0.5 or bottom < -0.5 or top > height - 0.5:
             continue
         for k in range(1, size - 1):
-            corners[count, 0] = polygon[0]
-            corners[count, 1] = polygon[k]
-            corners[count, 2] = polygon[k + 1]
+            for axis in range(3):
+                corners[count, 0, axis] = polygon[0, axis]
+                corners[count, 1, axis] = polygon[k, axis]
+                corners[count, 2, axis] = polygon[k + 1, axis]
             source[count] = f
             count += 1
     return corners[:count], source[:count]

@@ -125,7 +125,8 @@ def decompress(packed: Bytes, target: Bytes) -> int:
             length = control + 1
             if read + length > len(packed) or written + length > len(target):
                 return -1
-            target[written : written + length] = packed[read : read + length]
+            for k in range(length):
+                target[written + k] = packed[read + k]
             read += length
         else:
             length = (control >> 5) + 2
