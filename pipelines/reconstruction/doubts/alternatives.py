@@ -4,18 +4,19 @@ An alternative has a price that grows with its freedom: for how many there are o
 numbers. So of two that explain as much, the one with less freedom is named first. Nothing is weighed here.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, permutations, product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.mounting import level_heading
+from pipelines.geometry.mounting import FLU_FROM_FRD, body_from_camera, level_heading
 from pipelines.geometry.poses import (
+    ENU_FROM_NED,
     interpolate_rotations,
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -24,8 +25,10 @@ from pipelines.geometry.poses import (
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import (
     FEW,
+    HIPS,
     JOINTS,
     PLACED_M,
+    SIZE_SIGMA,
     STATURE_M,
     Body,
     Sampled,
@@ -47,9 +50,9 @@ PRICE_OF_ONE = 0.8
 LEAST_SIGMAS = 5.0
 """A stated value is doubted beyond this many of its standard deviations, because errors have heavy tails."""
 
-_FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
-_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
-_FLU_FROM_FRD = np.diag([1.0, -1, -1])
+_FLU_FROM_OPTICAL, _FLU_FROM_FRD, _ENU_FROM_NED = (
+    matrix_from_quaternion(each).round() for each in (body_from_camera("forward"), FLU_FROM_FRD, ENU_FROM_NED)
+)
 _FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
 _SIZE_FACTORS = (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3)  # pictures that a detector was given enlarged or reduced
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
@@ -102,13 +105,11 @@ class Trial:
     """The flight as described, beside which alternatives are made."""
 
     def __init__(self, flight: Sampled, described: SceneOfMoments) -> None:
-        self.flight = flight
+        self.flight, self.described = flight, described
         self.cameras: tuple[Filmed, ...] = flight.cameras
-        self.described = described
         self.names = tuple(camera.name for camera in flight.cameras)
         self.every = list(range(len(self.names)))
         self.moving = [index for index, camera in enumerate(flight.cameras) if not camera.static]
-
         # Whether anything but the cameras says where the world is.
         self.located = flight.hips is not None or flight.ground is not None
         self.is_loose_pair = not self.located and len(self.moving) == len(self.names) == 2
@@ -124,14 +125,32 @@ class Trial:
     def groups(self, members: Sequence[int]) -> Iterator[tuple[list[int], float]]:
         """Take all cameras together, then each, which is dearer."""
         if len(members) > 1:
-            yield list(members), 0.5
-        yield from (([index], 0.8) for index in members)
+            yield list(members), PRICE_OF_ALL
+        yield from (([index], PRICE_OF_ONE) for index in members)
+
+    def lines(self, group: Sequence[int], line_of: Callable[..., str], *values: Any, **named: Any) -> str:
+        """Write the lines of a remedy for the cameras of a group."""
+        return remedies.lines([self.cameras[index] for index in group], line_of, *values, **named)
 
     @cached_property
     def mounts(self) -> Float:
         """Return body_from_camera [C, 1, 3, 3]; looking forwards where a camera is not fixed to a body."""
         stored = [camera.mount for camera in self.cameras]
         return np.array([_FLU_FROM_OPTICAL if each is None else each for each in stored])[:, None]
+
+    @cached_property
+    def bodies(self) -> tuple[Float, dict[int, str | None]]:
+        """Return attitudes of bodies [C, T, 3, 3]; of those with gimbals, what the angles are relative to."""
+        body, on_gimbal = self.described.rotation @ self.mounts.mT, {}
+        gap_ns, t_ns = self.flight.between.max_gap_ns, self.flight.t_ns
+        for index in self.moving:
+            track = self.cameras[index].camera.trajectory
+            if track.body_xyzw is not None:
+                limits = {"max_gap_ns": gap_ns, "max_extrapolation_ns": gap_ns}
+                known = interpolate_rotations(track.t_ns, track.body_xyzw, t_ns, **limits)
+                body[index] = matrix_from_quaternion(known)
+                on_gimbal[index] = self.cameras[index].entry.poses.gimbal
+        return body, on_gimbal
 
     def with_times(self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0) -> SceneOfMoments:
         """Add seconds to the times of cameras' pictures, and let them follow each other more slowly."""
@@ -144,6 +163,25 @@ class Trial:
         moved = self.flight.at_other_times(late_s, slower)
         late, factor = np.full(len(self.names), late_s), np.full(len(self.names), slower)
         return scene_of(moved, late_s=late, slower=factor), moved
+
+    def posed(
+        self,
+        code: str,
+        what: str,
+        remedy: str,
+        rotation: Float,
+        position: Float | None = None,
+        *,
+        group: Sequence[int] | None = None,
+        price: float = PRICE_OF_ALL,
+        same_scatter: bool = False,
+    ) -> Alternative:
+        """Take attitudes [C, T, 3, 3] and places [C, T, 3] of a group, by default of all moving cameras."""
+        own, names = (self.moving, self.names) if group is None else (list(group), self.named(group))
+        turned, moved = self.described.rotation.copy(), self.described.position.copy()
+        turned[own], moved[own] = rotation[own], (moved if position is None else position)[own]
+        scene = replace(self.described, rotation=turned, position=moved)
+        return Alternative(code, names, what, remedy, price, scene, same_scatter)
 
     def with_pixels(self, group: Sequence[int], change: Callable[[Float, Filmed], Float]) -> SceneOfMoments:
         """Change the pixels [F, J, 2] of cameras."""
@@ -175,20 +213,6 @@ def rates(trial: Trial) -> Iterator[Alternative]:
             yield rate(trial, group, factor, price + dearer)
 
 
-def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> Alternative:
-    """Change the frame rate of one camera, or of all."""
-    alike = len(group) == len(trial.names)
-    return Alternative(
-        "frame_rate",
-        trial.named(group),
-        f"the frame rate of {trial.whose(group)} is {1 / factor:.3g} times what is stated",
-        remedies.frame_rate(trial.cameras, group, factor),
-        price,
-        trial.with_times(group, slower=factor),
-        same_pictures=partial(trial.with_all_times, 0.0, factor) if alike else None,
-    )
-
-
 def _is_usual(rate_hz: float) -> bool:
     return min(abs(rate_hz / usual - 1) for usual in _USUAL_RATES_HZ) < _SAME_RATE
 
@@ -200,18 +224,26 @@ def _unfilmed(camera: Filmed, slower: float = 1.0) -> float:
     return float(max(0, end - first - (last - first) * slower) / max(end - begin, 1))
 
 
+def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> Alternative:
+    """Change the frame rate of one camera, or of all."""
+    what = f"the frame rate of {trial.whose(group)} is {1 / factor:.3g} times what is stated"
+    remedy = trial.lines(group, remedies.frame_rate, factor)
+    return _of_times(trial, "frame_rate", group, what, remedy, price, slower=factor)
+
+
 def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
     """Move the clock of one camera, or of all."""
-    alike = len(group) == len(trial.names)
-    return Alternative(
-        "clock",
-        trial.named(group),
-        f"the pictures of {trial.whose(group)} were taken {remedies.earlier_or_later(late_s)}",
-        remedies.clock(trial.cameras, group, late_s),
-        1.0 + abs(late_s) / 2,
-        trial.with_times(group, late_s),
-        same_pictures=partial(trial.with_all_times, late_s) if alike else None,
-    )
+    what = f"the pictures of {trial.whose(group)} were taken {remedies.earlier_or_later(late_s)}"
+    remedy = trial.lines(group, remedies.clock, late_s)
+    return _of_times(trial, "clock", group, what, remedy, 1.0 + abs(late_s) / 2, late_s=late_s)
+
+
+def _of_times(
+    trial: Trial, code: str, group: list[int], what: str, remedy: str, price: float, **changes: float
+) -> Alternative:
+    same = partial(trial.with_all_times, **changes) if len(group) == len(trial.names) else None
+    scene = trial.with_times(group, **changes)
+    return Alternative(code, trial.named(group), what, remedy, price, scene, same_pictures=same)
 
 
 # --- the world -------------------------------------------------------------------------------------------
@@ -228,13 +260,6 @@ AXIS_WITHIN_DEG = 12.0
 MOST_LOSS_OF_EDGES = 0.25
 # Directions about the trunk are searched so far, which is farther than people lean.
 _SEARCHED = np.tan(np.radians(np.arange(-24.0, 25.0, 2.0)))
-# Two in three grown-ups have a stature within this share of the usual one.
-STATURE_SHARE = 0.09
-_UPS = {
-    f"{sign}{axis}": turn * np.eye(3)[k]
-    for sign, turn in (("", 1), ("-", -1))
-    for k, axis in enumerate("xyz")
-}
 
 
 def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
@@ -242,11 +267,11 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
 
     Both must say so: somebody may lie, and a camera may be rolled or look straight down.
     """
-    trunk = trunk_direction(joints)
+    trunk, z = trunk_direction(joints), np.array([0.0, 0.0, 1.0])
     steady = float(np.linalg.norm(trunk))
     if not steady > LEAST_STEADY_TRUNK:
         return
-    trunk, z = trunk / steady, np.array([0.0, 0.0, 1.0])
+    trunk = trunk / steady
     across = np.linalg.svd(trunk[None])[2][1:]
     about = np.stack(np.meshgrid(_SEARCHED, _SEARCHED), axis=-1).reshape(-1, 2) @ across
     ups = np.vstack([z, (trunk + about) / np.linalg.norm(trunk + about, axis=1, keepdims=True)])
@@ -258,11 +283,12 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     cost = rolled + ((ups - trunk) ** 2).sum(axis=1) / np.radians(LEAN_DEG) ** 2
     best = int(np.argmin(cost))
     up = ups[best]
-    tilt_deg, of_trunk_deg, left_deg = (
-        float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))) for cosine in (up @ z, trunk @ z, trunk @ up)
+    largest = int(np.argmax(np.abs(up)))
+    tilt_deg, of_trunk_deg, left_deg, beside_deg = (
+        float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        for cosine in (up @ z, trunk @ z, trunk @ up, abs(up[largest]))
     )
-    lost = float(np.nanmean(-rotation[..., 1] @ (z - up)))
-    gain = float(cost[0] - cost[best])
+    lost, gain = float(np.nanmean(-rotation[..., 1] @ (z - up))), float(cost[0] - cost[best])
     # Cameras that look the same way are not rolled where somebody lies along it: their edges must rise.
     is_rolled = rolled[0] - rolled[best] >= LEAST_GAIN_OF_UP / 2
     if (
@@ -272,23 +298,15 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
         or lost > (MOST_LOSS_OF_EDGES if is_rolled else -MOST_LOSS_OF_EDGES)
     ):
         return
-    axis = max(_UPS, key=lambda name: float(_UPS[name] @ up))
-    beside_deg = float(np.degrees(np.arccos(np.clip(_UPS[axis] @ up, -1, 1))))
-    remedy = f"world.up: {axis}"
+    remedy = f"world.up: {'-' if up[largest] < 0 else ''}{'xyz'[largest]}"
     if beside_deg > AXIS_WITHIN_DEG:
-        remedy = remedies.turned_world(trial.cameras, up)
-    yield Alternative(
-        "level",
-        trial.names,
-        f"the world's z does not point up: people and pictures are upright {tilt_deg:.0f} deg from it",
-        remedy,
-        0.0,
-        evidence={
-            "tilt_deg": round(tilt_deg, 1),
-            "beside_axis_deg": round(beside_deg, 1),
-            "gain": round(gain, 1),
-        },
-    )
+        quaternion = np.append(np.cross(up, z), 1.0 + up[2])  # the shortest rotation upwards
+        turn = matrix_from_quaternion(quaternion / np.linalg.norm(quaternion))
+        remedy = trial.lines(trial.every, remedies.placed, np.zeros(3), turn)
+    what = f"the world's z does not point up: people and pictures are upright {tilt_deg:.0f} deg from it"
+    evidence = {"tilt_deg": tilt_deg, "beside_axis_deg": beside_deg, "gain": gain}
+    evidence = {name: round(value, 1) for name, value in evidence.items()}
+    yield Alternative("level", trial.names, what, remedy, 0.0, evidence=evidence)
 
 
 def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterator[Alternative]:
@@ -299,27 +317,27 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
     """
     flight, described = trial.flight, trial.described
     # Any scale makes the person as tall as people are: that much surer the stature makes it (see `_freedom`).
-    price = PRICE_OF_ALL + np.log(1 / STATURE_SHARE) / 2 + dearer
+    price = PRICE_OF_ALL + np.log(1 / SIZE_SIGMA) / 2 + dearer
     size = STATURE_M / stature
     by_actor, sigma = _scaled_to_actor(trial, joints, size)
     # Units are far apart, so nearly all statures tell them.
-    near = max(2 * sigma, STATURE_SHARE)
+    near = max(2 * sigma, SIZE_SIGMA)
     unit = next((name for name, m in _UNITS_M.items() if abs(np.log(by_actor / m)) < near), None)
     alone = unit is not None
     if flight.truth_m is not None:
         alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
     for of_poses in (alone, not alone) if flight.truth_m is None and trial.located else (alone,):
         factor, code, cost, remedy = size, "scale", price, f"world.scale: {size:.3g}"
-        placed, evidence = flight.scaled(size), {"scale_sigma_share": STATURE_SHARE}
+        placed, evidence = flight.scaled(size), {"scale_sigma_share": SIZE_SIGMA}
         if of_poses:
-            factor, remedy, placed = by_actor, remedies.scaled(trial.cameras, by_actor), flight
-            evidence["scale_sigma_share"] = round(sigma, 3)
+            factor, placed, evidence["scale_sigma_share"] = by_actor, flight, round(sigma, 3)
+            remedy = trial.lines(trial.every, remedies.placed, np.zeros(3), factor=by_actor)
         what = f"all positions are {1 / factor:.2g} times what they should be:"
         what += f" the person is {stature:.3g} m tall"
         if of_poses and unit is not None:
             factor, code, evidence, cost = _UNITS_M[unit], "unit", {}, PRICE_OF_ALL
             what = f"the positions are in {unit}"
-            remedy = remedies.pose(trial.cameras, trial.every, f"unit: {unit}")
+            remedy = trial.lines(trial.every, remedies.pose, f"unit: {unit}")
         # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
         of_places = np.array([factor, 1.0] * 3)
         scene = replace(described, position=described.position * factor, sigma=described.sigma * of_places)
@@ -329,15 +347,15 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
 def _scaled_to_actor(trial: Trial, joints: Float, size: float) -> tuple[float, float]:
     """Return the factor of all positions that the stature and a logged actor show, and its relative error."""
     if trial.flight.hips is None:
-        return size, STATURE_SHARE
+        return size, SIZE_SIGMA
     hips = Body(joints).hips
     known = np.isfinite(hips + trial.flight.hips).all(axis=1)
     far2 = float((hips[known] ** 2).sum())
     factor = float((hips * trial.flight.hips)[known].sum()) / max(far2, 1e-9)
     if factor <= 0:
-        return size, STATURE_SHARE
+        return size, SIZE_SIGMA
     # As for fits: an actor's errors wander, and count as few.
-    weights = np.array([1 / STATURE_SHARE**2, FEW * factor**2 * far2 / known.sum() / PLACED_M**2])
+    weights = np.array([1 / SIZE_SIGMA**2, FEW * factor**2 * far2 / known.sum() / PLACED_M**2])
     found = float(np.exp(weights @ np.log([size, factor]) / weights.sum()))
     return found, float(1 / np.sqrt(weights.sum()))
 
@@ -348,85 +366,58 @@ def _scaled_to_actor(trial: Trial, joints: Float, size: float) -> tuple[float, f
 def discrete(trial: Trial) -> Iterator[Alternative]:
     """Try exchanged pictures, other mounts and gimbals, other conventions, and other keypoints."""
     yield from _exchanged_pictures(trial)
-    scene = trial.described
-    written: dict[tuple[str, bool], list[int]] = {}  # who wrote the poses
-    for index in trial.moving:
-        poses = trial.cameras[index].entry.poses
-        written.setdefault((Path(poses.source).suffix.lower(), poses.topic is None), []).append(index)
-    kinds: list[Sequence[int] | None] = [None, *(written.values() if len(written) > 1 else ())]
-    conventions = chain.from_iterable(_conventions(trial, kind) for kind in kinds)
-    kinds += [[index] for index in trial.moving if len(trial.moving) > 1 and [index] not in kinds]
-    units = chain.from_iterable(_units(trial, kind) for kind in kinds)
-    for row in chain(_mounts(trial), _gimbals(trial), conventions, units) if trial.moving else ():
-        group = trial.moving if row.group is None else row.group
-        rotation, position = scene.rotation.copy(), scene.position.copy()
-        rotation[group] = row.rotation[group]
-        if row.position is not None:
-            position[group] = row.position[group]
-        named = trial.names if row.group is None else trial.named(group)
-        posed = replace(scene, rotation=rotation, position=position)
-        yield Alternative(row.code, named, row.what, row.remedy, row.price, posed, row.same_scatter)
+    if trial.moving:
+        written: dict[tuple[str, bool], list[int]] = {}  # who wrote the poses
+        for index in trial.moving:
+            poses = trial.cameras[index].entry.poses
+            written.setdefault((Path(poses.source).suffix.lower(), poses.topic is None), []).append(index)
+        kinds: list[list[int] | None] = [None, *(written.values() if len(written) > 1 else ())]
+        each = [[index] for index in trial.moving if len(trial.moving) > 1 and [index] not in kinds]
+        yield from chain(_mounts(trial), _gimbals(trial), *(_conventions(trial, kind) for kind in kinds))
+        yield from chain(*(_units(trial, kind) for kind in [*kinds, *each]))
     yield from _keypoints(trial)
+    price = PRICE_OF_ALL + np.log(len(_FOCAL_FACTORS)) / 2
     for factor in _FOCAL_FACTORS:
-        yield Alternative(
-            "intrinsics",
-            trial.names,
-            f"the focal length of every camera is {factor:.3g} times what is stated",
-            remedies.intrinsics(trial.cameras, trial.every, factor),
-            PRICE_OF_ALL + np.log(len(_FOCAL_FACTORS)) / 2,
-            changed(scene, "focal", trial.every, np.log([factor])),
-        )
-
-
-class Posed(NamedTuple):
-    """A row of the table of other poses."""
-
-    code: str
-    what: str
-    remedy: str
-    rotation: Float  # [C, T, 3, 3] world_from_camera; those of the group are taken
-    position: Float | None = None  # [C, T, 3]; None as described
-    group: Sequence[int] | None = None  # None for all moving cameras
-    price: float = PRICE_OF_ALL
-    same_scatter: bool = False
+        what = f"the focal length of every camera is {factor:.3g} times what is stated"
+        remedy = trial.lines(trial.every, remedies.lens, factor)
+        scene = changed(trial.described, "focal", trial.every, np.log([factor]))
+        yield Alternative("intrinsics", trial.names, what, remedy, price, scene)
 
 
 def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
-    names = trial.names
+    names, cameras = trial.names, trial.cameras
+    price = PRICE_OF_ALL if len(names) == 2 else PRICE_OF_ONE  # of more cameras there are more ways
     for order in permutations(trial.every) if 2 <= len(names) <= 5 else ():
         moved = [index for index in trial.every if order[index] != index]
         if moved:
             owners = ", ".join(f"{names[index]} has those of {names[order[index]]}" for index in moved)
-            yield Alternative(
-                "videos_swapped",
-                trial.named(moved),
-                f"pictures are exchanged: {owners}",
-                remedies.videos(trial.cameras, order),
-                0.5 if len(names) == 2 else 0.8,  # of more cameras there are more ways
-                scene_of(trial.flight, trial.described, order=order),
+            remedy = "; ".join(
+                trial.lines([index], remedies.pictures_of, cameras[order[index]]) for index in moved
             )
+            scene = scene_of(trial.flight, trial.described, order=order)
+            what = f"pictures are exchanged: {owners}"
+            yield Alternative("videos_swapped", trial.named(moved), what, remedy, price, scene)
 
 
-def _mounts(trial: Trial) -> Iterator[Posed]:
+def _mounts(trial: Trial) -> Iterator[Alternative]:
     """Try cameras that are rolled, or look another way, by right angles, and the other sign of tilts."""
-    rotation, cameras, mounts = trial.described.rotation, trial.cameras, trial.mounts
-    for (group, price), degrees in product(trial.groups(trial.moving), (90, 180, 270)):
+    rotation, mounts = trial.described.rotation, trial.mounts
+    for (group, price), degrees in product(trial.groups(trial.moving), (90, 180, -90)):
         turn, whose = turn_about("z", degrees), trial.whose(group)
-        signed = degrees if degrees <= 180 else degrees - 360
-        rolled = f"{whose} is rolled by {signed} deg about the optical axis"
-        remedy = remedies.mount(cameras, group, after=turn)
-        yield Posed("mount", rolled, remedy, rotation @ turn, None, group, price)
-        side = "left" if degrees <= 180 else "right"
-        aside = f"{whose} is mounted {abs(signed)} deg to the {side} of where it is said to look"
-        remedy = remedies.mount(cameras, group, before=turn)
-        yield Posed("mount", aside, remedy, rotation @ mounts.mT @ turn @ mounts, None, group, price)
-    down = {index: remedies.down_deg(cameras[index]) for index in trial.moving}
+        rolled = f"{whose} is rolled by {degrees} deg about the optical axis"
+        remedy = trial.lines(group, remedies.mount, after=turn)
+        yield trial.posed("mount", rolled, remedy, rotation @ turn, group=group, price=price)
+        side, aside = "left" if degrees > 0 else "right", rotation @ mounts.mT @ turn @ mounts
+        what = f"{whose} is mounted {abs(degrees)} deg to the {side} of where it is said to look"
+        remedy = trial.lines(group, remedies.mount, before=turn)
+        yield trial.posed("mount", what, remedy, aside, group=group, price=price)
+    down = {index: remedies.down_deg(trial.cameras[index]) for index in trial.moving}
     tilted = {index: turn_about("x", 2 * degrees) for index, degrees in down.items() if abs(degrees) > 1}
     if tilted:
-        what = "the tilt of every camera has the wrong sign"
-        remedy = "; ".join(remedies.mount(cameras, [index], after=turn) for index, turn in tilted.items())
+        remedy = "; ".join(trial.lines([i], remedies.mount, after=turn) for i, turn in tilted.items())
         turns = np.array([tilted.get(index, np.eye(3)) for index in trial.every])[:, None]
-        yield Posed("mount", what, remedy, rotation @ turns, None, list(tilted))
+        what = "the tilt of every camera has the wrong sign"
+        yield trial.posed("mount", what, remedy, rotation @ turns, group=list(tilted))
 
 
 _MEANT = {
@@ -436,46 +427,31 @@ _MEANT = {
 }
 
 
-def _gimbals(trial: Trial) -> Iterator[Posed]:
+def _gimbals(trial: Trial) -> Iterator[Alternative]:
     """Try the other axes of gimbals' angles, and angles that are relative to something else."""
-    rotation, mounts = trial.described.rotation, trial.mounts
+    rotation, mounts, rows = trial.described.rotation, trial.mounts, []
+    body, on_gimbal = trial.bodies
     of = {index: trial.cameras[index].entry.poses for index in trial.moving}
-
-    def row(group: list[int], what: str, line: str, turned: Float) -> Posed:
-        remedy = "; ".join(f"cameras.{trial.names[index]}.gimbal.{line}" for index in group)
-        return Posed("gimbal", f"the gimbals' angles are {what}", remedy, turned, None, group)
-
     group = [index for index, poses in of.items() if poses.gimbal == "world" and not poses.gimbal_fixed]
     if group:
         right = "enu" if of[group[0]].gimbal_axes == "ned" else "ned"
         turned = _ENU_FROM_NED @ rotation @ mounts.mT @ _FLU_FROM_FRD @ mounts
-        yield row(group, f"in {right.upper()}: tilts have the wrong sign", f"axes: {right}", turned)
+        rows.append((group, f"in {right.upper()}: tilts have the wrong sign", f"axes: {right}", turned))
     for meant, stated in _MEANT.items():
         turned, group = rotation.copy(), []
-        for index, poses in of.items():
-            body = _body(trial, index)
-            if poses.gimbal not in _MEANT or poses.gimbal == meant or body is None:
+        for index, relative_to in on_gimbal.items():
+            if relative_to not in _MEANT or relative_to == meant:
                 continue
-            frames = _frames(body)
+            poses, frames = of[index], _frames(body[index])
             if poses.gimbal_axes == "ned":
-                frames = {
-                    name: frame @ (_ENU_FROM_NED if name == "world" else _FLU_FROM_FRD)
-                    for name, frame in frames.items()
-                }
-            turned[index] = frames[meant] @ frames[poses.gimbal].mT @ rotation[index]
+                for name in frames:
+                    frames[name] = frames[name] @ (_ENU_FROM_NED if name == "world" else _FLU_FROM_FRD)
+            turned[index] = frames[meant] @ frames[relative_to].mT @ rotation[index]
             group.append(index)
-        if group:
-            yield row(group, stated, f"relative_to: {meant}", turned)
-
-
-def _body(trial: Trial, index: int) -> Float | None:
-    """Return the attitudes [T, 3, 3] of the body that carries a camera on a gimbal, if it is logged."""
-    track, t_ns = trial.cameras[index].camera.trajectory, trial.flight.t_ns
-    if track.body_xyzw is None:
-        return None
-    gap_ns = trial.flight.between.max_gap_ns
-    limits = {"max_gap_ns": gap_ns, "max_extrapolation_ns": gap_ns}
-    return matrix_from_quaternion(interpolate_rotations(track.t_ns, track.body_xyzw, t_ns, **limits))
+        rows += [(group, stated, f"relative_to: {meant}", turned)] if group else []
+    for group, what, line, turned in rows:
+        remedy = trial.lines(group, remedies.as_said, f"gimbal.{line}")
+        yield trial.posed("gimbal", f"the gimbals' angles are {what}", remedy, turned, group=group)
 
 
 def _frames(body: Float) -> dict[str, Float]:
@@ -488,16 +464,15 @@ def _frames(body: Float) -> dict[str, Float]:
     }
 
 
-def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
+def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternative]:
     """Try other meanings of the logged poses: axes, inverses, orders of quaternions.
 
     `kind` are the cameras with logs of one kind; None for all that move.
     """
     moving = trial.moving if kind is None else kind
     price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
-    scene, cameras, mounts = trial.described, trial.cameras, trial.mounts
-    camera, place = scene.rotation, scene.position
-    body, on_gimbal = _bodies(trial, moving)
+    mounts, camera, place = trial.mounts, trial.described.rotation, trial.described.position
+    body, on_gimbal = trial.bodies
 
     def carried_by(bodies: Float) -> Float:
         """Return the attitudes [C, T, 3, 3] of the cameras on bodies that are turned otherwise."""
@@ -508,73 +483,52 @@ def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
                 turned[index] = after @ before.mT @ camera[index]
         return turned
 
-    stated = cameras[moving[0]].entry.poses
+    held = [trial.cameras[index].entry.poses for index in moving]
     # The exchange of axes is its own inverse.
-    axes, frame = ("enu", "FLU") if stated.axes == "ned" else ("ned", "FRD")
-    in_axes = f"the poses are in {axes.upper()}, of"
+    axes, frame = ("enu", "FLU") if held[0].axes == "ned" else ("ned", "FRD")
+    in_axes, z = f"the poses are in {axes.upper()}, of", "up" if held[0].z == "down" else "down"
     of_camera, of_body = (
-        f"world_from_{of}" if stated.inverse else f"{of}_from_world" for of in ("camera", "body")
+        f"world_from_{of}" if held[0].inverse else f"{of}_from_world" for of in ("camera", "body")
     )
-    exchanged = remedies.pose(cameras, moving, f"axes: {axes}")
-    upside_down = remedies.pose(cameras, moving, remedies.upside_down)
-    inverted = remedies.pose(cameras, moving, lambda poses: f"inverse: {str(not poses.inverse).lower()}")
-    its_own = remedies.pose(cameras, moving, remedies.OF_CAMERA)
-    the_body = remedies.pose(cameras, moving, remedies.OF_BODY)
-    z = "up" if stated.z == "down" else "down"
-    turned = carried_by(_ENU_FROM_NED @ body @ _FLU_FROM_FRD)
-    camera_back, body_back = camera.mT, body.mT
-    camera_origin, body_origin = (
-        -np.einsum("ctij,ctj->cti", back, place) for back in (camera_back, body_back)
-    )
-    ned, below, swapped = place @ _ENU_FROM_NED.T, place * [1.0, 1.0, -1.0], place[..., [1, 0, 2]]
+    back, body_back, ned = camera.mT, body.mT, place @ _ENU_FROM_NED.T
+    origin, body_origin = (-np.einsum("ctij,ctj->cti", each, place) for each in (back, body_back))
     on_body, own = camera @ _FLU_FROM_OPTICAL, body_back @ mounts
-    table: list[tuple[str, str, str, Float, Float]] = [
-        ("axes", "the positions have x and y exchanged", "", camera, swapped),
-        ("convention", f"the poses are {of_camera}", inverted, camera_back, camera_origin),
-        ("convention", f"the poses are {of_body}", inverted, carried_by(body_back), body_origin),
-        ("convention", f"the attitudes are {of_camera}, the positions are not", "", camera_back, place),
+    to_body, to_camera = remedies.OF_BODY, remedies.OF_CAMERA
+    table: list[tuple[str, str, remedies.Options, Float, Float]] = [
+        ("axes", "the positions have x and y exchanged", "", camera, place[..., [1, 0, 2]]),
+        ("convention", f"the poses are {of_camera}", remedies.inverse, back, origin),
+        ("convention", f"the poses are {of_body}", remedies.inverse, carried_by(body_back), body_origin),
+        ("convention", f"the attitudes are {of_camera}, the positions are not", "", back, place),
         ("convention", f"the attitudes are {of_body}, the positions are not", "", own, place),
-        ("convention", "the poses are of the body, and are taken for the camera's", the_body, on_body, place),
-        ("convention", "the poses are of the camera, and are taken for the body's", its_own, body, place),
+        ("convention", "the poses are of the body, and are taken for the camera's", to_body, on_body, place),
+        ("convention", "the poses are of the camera, and are taken for the body's", to_camera, body, place),
     ]
     if np.nanmedian(place[moving, :, 2]) < 0:  # nobody takes off far above where they fly
         what = f"the positions count z {z}wards, the attitudes do not"
-        table.append(("axes", what, upside_down, camera, below))
-    held = [cameras[index].entry.poses for index in moving]
+        table.append(("axes", what, remedies.upside_down, camera, place * [1.0, 1.0, -1.0]))
     if any(poses.mount or poses.in_gimbal for poses in held):
-        table.append(("axes", f"{in_axes} a body with {frame} axes", exchanged, turned, ned))
+        turned = carried_by(_ENU_FROM_NED @ body @ _FLU_FROM_FRD)
+        table.append(("axes", f"{in_axes} a body with {frame} axes", f"axes: {axes}", turned, ned))
     if any(poses.mount is None for poses in held):
-        table.append(("axes", f"{in_axes} the camera", exchanged, _ENU_FROM_NED @ camera, ned))
-    if any(poses.mount for poses in held):
-        # Of poses of the camera itself, it would be a roll by 180 deg.
-        remedy = remedies.mount(cameras, moving, before=_FLU_FROM_FRD)
-        what = "the body's axes are FRD (forward, right, down)"
-        table.append(("axes", what, remedy, body @ _FLU_FROM_FRD @ mounts, place))
+        table.append(("axes", f"{in_axes} the camera", f"axes: {axes}", _ENU_FROM_NED @ camera, ned))
     for attitudes, of_cameras in ((camera, np.asarray), (body, carried_by)):
         quaternion = quaternion_from_matrix(np.where(np.isfinite(attitudes), attitudes, np.eye(3)))
         for roll, order in ((-1, "wxyz"), (1, "xyzw")):
-            turned = matrix_from_quaternion(np.roll(quaternion, roll, axis=-1))
-            remedy = remedies.pose(cameras, moving, f"quaternion: {order}")
+            turned = of_cameras(matrix_from_quaternion(np.roll(quaternion, roll, axis=-1)))
             what = f"the quaternions are written as {' '.join(order)}"
-            table.append(("convention", what, remedy, of_cameras(turned), place))
-    for code, what, remedy, rotation, position in table:
-        yield Posed(
-            code, what, remedy or f"write the log again, since {what}", rotation, position, kind, price
-        )
+            table.append(("convention", what, f"quaternion: {order}", turned, place))
+    for code, what, options, rotation, position in table:
+        again = f"write the log again, since {what}"
+        remedy = trial.lines(moving, remedies.pose, options) if options else again
+        yield trial.posed(code, what, remedy, rotation, position, group=kind, price=price)
+    if any(poses.mount for poses in held):
+        # Of poses of the camera itself, it would be a roll by 180 deg.
+        remedy = trial.lines(moving, remedies.mount, before=_FLU_FROM_FRD)
+        what, turned = "the body's axes are FRD (forward, right, down)", body @ _FLU_FROM_FRD @ mounts
+        yield trial.posed("axes", what, remedy, turned, group=kind, price=price)
 
 
-def _bodies(trial: Trial, moving: Sequence[int]) -> tuple[Float, dict[int, str | None]]:
-    """Return the attitudes of bodies [C, T, 3, 3], and what gimbals' angles are relative to."""
-    body, on_gimbal = trial.described.rotation @ trial.mounts.mT, {}
-    for index in moving:
-        own = _body(trial, index)
-        if own is not None:
-            body[index] = own
-            on_gimbal[index] = trial.cameras[index].entry.poses.gimbal
-    return body, on_gimbal
-
-
-def _units(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
+def _units(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternative]:
     """Try other units of the logged positions, of cameras as in `_conventions`."""
     moving = trial.moving if kind is None else kind
     price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
@@ -582,52 +536,49 @@ def _units(trial: Trial, kind: Sequence[int] | None) -> Iterator[Posed]:
     whose = "" if kind is None else f" of {', '.join(trial.named(kind))}"
     # Lever arms are stated in metres, whatever the log's unit.
     levers = np.array([each.lever_m for each in trial.cameras])
-    arms = np.einsum("ctij,cj->cti", _bodies(trial, moving)[0], levers)
+    arms = np.einsum("ctij,cj->cti", trial.bodies[0], levers)
     for name, metres in _UNITS_M.items():
-        what, again = f"the positions{whose} are in {name}", f", and {1 / metres:.4g} times what is read"
+        again = f", and {1 / metres:.4g} times what is read"
         for unit, factor, known in ((name, metres, ""), ("m", 1 / metres, again)):
-            shown = what.replace(f"in {name}", f"in {unit}") + known
-            remedy = remedies.pose(trial.cameras, moving, f"unit: {unit}")
-            there = (place - arms) * factor + arms
-            yield Posed("unit", shown, remedy, camera, there, kind, price, same_scatter=kind is None)
+            what, there = f"the positions{whose} are in {unit}{known}", (place - arms) * factor + arms
+            remedy, same = trial.lines(moving, remedies.pose, f"unit: {unit}"), kind is None
+            yield trial.posed("unit", what, remedy, camera, there, group=kind, price=price, same_scatter=same)
+
+
+# What is mirrored, if a detector does it alike in all pictures, its price, and its sentence.
+_MIRRORED = {
+    "true": (False, 0.0, "the pictures{} were mirrored before the keypoints were found"),
+    "x": (False, 0.0, "the keypoints{} count x from the right"),
+    "y": (True, 0.0, "the keypoints count y from below"),
+    "names": (True, 0.3, "left and right are exchanged in the names of joints"),
+}
 
 
 def _keypoints(trial: Trial) -> Iterator[Alternative]:
     """Try keypoints of pictures of another size, and mirrored ones: of all cameras, then of each."""
-
-    def x(pixels: Float, own: Filmed) -> Float:
-        return np.stack([own.intrinsics.width - 1 - pixels[..., 0], pixels[..., 1]], axis=-1)
-
-    def y(pixels: Float, own: Filmed) -> Float:
-        return np.stack([pixels[..., 0], own.intrinsics.height - 1 - pixels[..., 1]], axis=-1)
-
     for group, price in trial.groups(trial.every):
-        one = len(group) < len(trial.names)
-        whose = f" of {trial.names[group[0]]}" if one else ""
-        rows: list[tuple[str, str, str, float, Callable[[Float, Filmed], Float]]] = [
-            (
-                "keypoints_size",
-                f"the keypoints{whose} are of pictures {1 / factor:.3g} times as large",
-                remedies.keypoints_size(trial.cameras, group, 1 / factor),
-                0.0,
-                partial(lambda factor, pixels, _: pixels * factor, factor),
-            )
-            for factor in _SIZE_FACTORS
-        ]
-        of_pictures = f"the pictures{whose} were mirrored before the keypoints were found"
-        flips = [
-            ("true", of_pictures, 0.0, lambda pixels, own: x(pixels, own)[:, _LEFT_RIGHT]),
-            ("x", f"the keypoints{whose} count x from the right", 0.0, x),
-        ]
-        if not one:  # a detector names and counts alike in all pictures
-            names = "left and right are exchanged in the names of joints"
-            flips.append(("y", "the keypoints count y from below", 0.0, y))
-            flips.append(("names", names, 0.3, lambda pixels, _: pixels[:, _LEFT_RIGHT]))
-        for value, what, dearer, change in flips:
-            rows.append(("mirrored", what, remedies.mirrored(trial.cameras, group, value), dearer, change))
-        for code, what, remedy, dearer, change in rows:
-            scene = trial.with_pixels(group, change)
-            yield Alternative(code, trial.named(group), what, remedy, price + dearer, scene)
+        one, named = len(group) < len(trial.names), trial.named(group)
+        whose = f" of {named[0]}" if one else ""
+        for factor in _SIZE_FACTORS:
+            what = f"the keypoints{whose} are of pictures {1 / factor:.3g} times as large"
+            remedy = trial.lines(group, remedies.keypoints_size, 1 / factor)
+            scene = trial.with_pixels(group, partial(_enlarged, factor))
+            yield Alternative("keypoints_size", named, what, remedy, price, scene)
+        for value, (of_all, dearer, what) in _MIRRORED.items():
+            if not (one and of_all):
+                scene = trial.with_pixels(group, partial(_mirrored, remedies.MIRRORS[value]))
+                remedy = remedies.mirrored([trial.cameras[index] for index in group], value)
+                yield Alternative("mirrored", named, what.format(whose), remedy, price + dearer, scene)
+
+
+def _enlarged(factor: float, pixels: Float, _: Filmed) -> Float:
+    return pixels * factor
+
+
+def _mirrored(parts: Set[str], pixels: Float, own: Filmed) -> Float:
+    last = np.array([own.intrinsics.width, own.intrinsics.height]) - 1
+    mirrored = np.where(["x" in parts, "y" in parts], last - pixels, pixels)
+    return mirrored[:, _LEFT_RIGHT] if "names" in parts else mirrored
 
 
 # --- alternatives with numbers, which are fitted ---------------------------------------------------------
@@ -699,19 +650,18 @@ def numbers_of_one(trial: Trial) -> Iterator[Numbers]:
         yield _numbers(trial, kind, [index])
 
 
-def _matters(trial: Trial, kind: str, group: Sequence[int], numbers: Float) -> bool:
-    """Test if numbers are beyond what is stated of the errors of the poses, and large enough to matter."""
-    position_m, rotation_rad = LEAST_SIGMAS * trial.described.sigma[list(group), :2].max(axis=0)
+def _is_fault(trial: Trial, kind: str, group: Sequence[int], numbers: Float, covariance: Float) -> bool:
+    """Test if numbers differ from zero, and matter beside what is stated of the errors of the poses."""
+    if not numbers @ np.linalg.pinv(covariance) @ numbers > _LEAST_OWN_SIGMAS**2:
+        return False
     if kind == "focal":
         return abs(float(numbers[0])) >= _LEAST_ZOOM
-    shift_m = float(np.linalg.norm(numbers[:3])) if NUMBERS[kind] >= 3 else 0.0
+    position_m, rotation_rad = LEAST_SIGMAS * trial.described.sigma[list(group), :2].max(axis=0)
+    shifts = numbers[: len(numbers) // 3 * 3].reshape(-1, 3)
+    least_m = np.linalg.norm(shifts, axis=1).min(initial=np.inf)
     turn_rad = abs(float(numbers[-1])) if kind != "shift" else 0.0
-    return bool(shift_m >= max(position_m, _LEAST_SHIFT_M) or turn_rad >= max(rotation_rad, _LEAST_TURN_RAD))
-
-
-def _is_sure(numbers: Float, covariance: Float) -> bool:
-    """Test if fitted numbers differ from zero, by their own covariance."""
-    return float(numbers @ np.linalg.pinv(covariance) @ numbers) > _LEAST_OWN_SIGMAS**2
+    is_moved = bool(len(shifts)) and least_m >= max(position_m, _LEAST_SHIFT_M)
+    return bool(is_moved or turn_rad >= max(rotation_rad, _LEAST_TURN_RAD))
 
 
 def _numbers(trial: Trial, kind: str, group: list[int]) -> Numbers:
@@ -719,42 +669,44 @@ def _numbers(trial: Trial, kind: str, group: list[int]) -> Numbers:
     degrees = list(_STARTS_DEG.get(kind, range(-180, 180, 15)))
     starts = np.zeros((len(degrees), NUMBERS[kind]))
     starts[:, -1] = np.radians(degrees)
-    return Numbers(
-        lambda numbers: changed(trial.described, kind, group, numbers),
-        starts,
-        lambda numbers, covariance: _of_numbers(trial, kind, group, numbers, covariance),
-    )
+    make = partial(changed, trial.described, kind, group)
+    return Numbers(make, starts, partial(_of_numbers, trial, kind, group))
 
 
 def _of_numbers(
     trial: Trial, kind: str, group: list[int], numbers: Float, covariance: Float
 ) -> Alternative | None:
     """State fitted numbers and their remedy; None if they are too small to matter."""
-    if not _is_sure(numbers, covariance) or not _matters(trial, kind, group, numbers):
+    if not _is_fault(trial, kind, group, numbers, covariance):
         return None
-    cameras, whose, number = trial.cameras, trial.whose(group), float(numbers[-1])
+    whose, number, variance = trial.whose(group), float(numbers[-1]), np.diag(covariance)
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
     shift = numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
     far = f"{np.linalg.norm(shift):.1f} m"
-    what = {
-        "shift": f"the log of {whose} has its zero {far} from the world's",
-        "north": f"the log of {whose} has its north {degrees:+.0f} deg from the world's",
-        "zero": f"the log of {whose} has its zero {far} and its north {degrees:+.0f} deg from the world's",
-        "heading": f"the heading of {whose} is {degrees:+.0f} deg from what is logged",
-        "pitch": f"{whose} looks {abs(degrees):.0f} deg {'higher' if degrees > 0 else 'lower'} than stated",
-        "roll": f"{whose} is rolled by {degrees:+.0f} deg about the optical axis",
-        "focal": f"the focal length of {whose} is {zoom(number):.3g} times what is stated",
+    code, what = {
+        "shift": ("origin", f"the log of {whose} has its zero {far} from the world's"),
+        "north": ("origin", f"the log of {whose} has its north {degrees:+.0f} deg from the world's"),
+        "zero": (
+            "origin",
+            f"the log of {whose} has its zero {far} and its north {degrees:+.0f} deg from the world's",
+        ),
+        "heading": ("pose", f"the heading of {whose} is {degrees:+.0f} deg from what is logged"),
+        "pitch": (
+            "mount",
+            f"{whose} looks {abs(degrees):.0f} deg {'higher' if degrees > 0 else 'lower'} than stated",
+        ),
+        "roll": ("mount", f"{whose} is rolled by {degrees:+.0f} deg about the optical axis"),
+        "focal": ("intrinsics", f"the focal length of {whose} is {zoom(number):.3g} times what is stated"),
     }[kind]
+    turn = turn_about("x" if kind == "pitch" else "z", degrees)
     if kind == "focal":
-        code, remedy = "intrinsics", remedies.intrinsics(cameras, group, zoom(number))
-    elif kind in ("shift", "north", "zero"):
-        code, remedy = "origin", remedies.origin(cameras, group[0], shift, np.radians(degrees))
-    elif kind == "heading":
-        code, remedy = "pose", _turned_about_vertical(trial, group, number)
+        remedy = trial.lines(group, remedies.lens, zoom(number))
+    elif code == "origin":
+        remedy = trial.lines(group, remedies.placed, shift, turn)
+    elif code == "mount":
+        remedy = trial.lines(group, remedies.mount, after=turn)
     else:
-        turn = turn_about("x" if kind == "pitch" else "z", degrees)
-        code, remedy = "mount", remedies.mount(cameras, group, after=turn)
-    variance = np.diag(covariance)
+        remedy = _turned_about_vertical(trial, group, number)
     evidence = {}
     if NUMBERS[kind] >= 3:
         evidence["shift_sigma_m"] = round(float(np.sqrt(variance[:3].sum())), 2)
@@ -769,7 +721,7 @@ def _turned_about_vertical(trial: Trial, group: Sequence[int], angle_rad: float)
     vertical = np.nansum(trial.described.rotation[:, :, 2], axis=1)
     vertical /= np.maximum(np.linalg.norm(vertical, axis=1, keepdims=True), 1e-9)
     turns = matrix_from_quaternion(quaternion_from_rotation_vector(angle_rad * vertical))
-    return "; ".join(remedies.mount(trial.cameras, [index], after=turns[index]) for index in group)
+    return "; ".join(trial.lines([index], remedies.mount, after=turns[index]) for index in group)
 
 
 def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
@@ -779,12 +731,10 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
     tall in its pictures. Without a logged actor, the world is that of the first log.
     """
     flight, scene = trial.flight, trial.described
-    moved = (
-        trial.moving if flight.hips is not None or len(trial.moving) < len(trial.names) else trial.moving[1:]
-    )
-    hips = [JOINTS.index("left_hip"), JOINTS.index("right_hip")]
+    is_fixed = flight.hips is not None or len(trial.moving) < len(trial.names)
+    moved = trial.moving if is_fixed else trial.moving[1:]
     away_m = scene.focal_px * STATURE_M * _NOSE_TO_ANKLES / np.maximum(scene.person_px, 1.0)
-    rays = np.concatenate([scene.rays[:, :, hips], np.ones((*scene.rays.shape[:2], 2, 1))], axis=-1)
+    rays = np.concatenate([scene.rays[:, :, HIPS], np.ones((*scene.rays.shape[:2], 2, 1))], axis=-1)
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).mean(axis=2)
     seen = scene.position + away_m[:, None, None] * np.einsum("ctij,ctj->cti", scene.rotation, rays)
     apart = (seen[0] if flight.hips is None else flight.hips) - seen
@@ -796,16 +746,13 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
         return replace(scene, position=position)
 
     def alternative(numbers: Float, covariance: Float) -> Alternative | None:
-        matters = all(_matters(trial, "shift", moved, shift) for shift in numbers.reshape(-1, 3))
-        if not matters or not _is_sure(numbers, covariance):
+        if not _is_fault(trial, "shift", moved, numbers, covariance):
             return None
-        shifts = np.zeros((len(trial.names), 3))
-        shifts[moved] = numbers.reshape(-1, 3)
         sigma_m = np.sqrt(np.diag(covariance).reshape(-1, 3).sum(axis=1)).max() if covariance.size else 0.0
-        remedy, evidence = remedies.own_origins(trial.cameras, shifts), {"shift_sigma_m": round(sigma_m, 2)}
-        return Alternative(
-            "origin", cameras, what, remedy, PRICE_OF_ALL, same_scatter=True, evidence=evidence
-        )
+        shifts = zip(moved, numbers.reshape(-1, 3), strict=True)
+        remedy = "; ".join(trial.lines([index], remedies.placed, shift) for index, shift in shifts)
+        evidence = {"shift_sigma_m": round(sigma_m, 2)}
+        return Alternative("origin", cameras, what, remedy, PRICE_OF_ALL, None, True, evidence)
 
     return Numbers(make, np.concatenate(start)[None], alternative)
 
@@ -825,18 +772,13 @@ def larger_errors(trial: Trial) -> Iterator[list[Alternative]]:
     for group in groups if trial.moving else ():
         whose = "" if len(group) == len(trial.names) else f" of {trial.names[group[0]]}"
         stated = "stated" if trial.cameras[group[0]].states_noise else "usual"
-        tried = []
+        tried, code = [], "pose" if whose else "noise"
         for factor in _NOISE_FACTORS:
             sigma = trial.described.sigma.copy()
             sigma[group] *= factor
-            tried.append(
-                Alternative(
-                    "pose" if whose else "noise",
-                    trial.named(group),
-                    f"errors of the poses{whose} are larger than {stated}, about {factor:g} times",
-                    remedies.pose_noise(trial.cameras, group, factor),
-                    np.inf,
-                    replace(trial.described, sigma=sigma),
-                )
-            )
+            what = f"errors of the poses{whose} are larger than {stated}, about {factor:g} times"
+            moving = [index for index in group if index in trial.moving]
+            remedy = trial.lines(moving, remedies.pose_noise, factor)
+            scene = replace(trial.described, sigma=sigma)
+            tried.append(Alternative(code, trial.named(group), what, remedy, np.inf, scene))
         yield tried

@@ -156,17 +156,12 @@ def doubts_of(
         if doubt.code == "unit" and set(doubt.cameras) == set(description.cameras):
             return [doubt]  # rays tell little in a world of another size
     last = deque(each_map(folder) if description.map is not None else (), maxlen=1)
+    actor, between = logged_actor(folder, description), description.pose_interpolation
     known = partial(
-        sample,
-        cameras,
-        description,
-        actor=logged_actor(folder, description),
-        last_map=last[0] if last else None,
-        pose_noise=pose_noise,
+        sample, cameras, description, actor=actor, last_map=last[0] if last else None, pose_noise=pose_noise
     )
-    turns = all_turns(cameras, followed)
     first_ns = [description.cameras[camera.name].frames.first_t_ns for camera in cameras]
-    late = lateness(cameras, turns, description.pose_interpolation, RATES, first_ns)
+    late = lateness(cameras, all_turns(cameras, followed), between, RATES, first_ns)
     flight = _more_plausible(known(chosen=chosen), known())
     truth = load_truth(folder, description, JOINTS)
     if flight is not None and truth is not None:
@@ -177,7 +172,7 @@ def doubts_of(
         seen = followed.get(camera.name)
         # Attitudes by pictures are not compared with themselves.
         if isinstance(seen, Followed) and camera.entry.picture_map is None:
-            looks[index] = partial(aside, camera.camera, seen, description.pose_interpolation)
+            looks[index] = partial(aside, camera.camera, seen, between)
     found = diagnose(flight, late, looks)
     # A gimbal that nothing uses, where it can be, explains more than any other change would.
     unused = [doubt for doubt in description.doubts if doubt.code == "unused" and found]
@@ -194,16 +189,11 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
         offset = remedies.offset_of(description.cameras[name], late_s)
         either = found["by"] == "keypoints" and len(description.cameras) == 2
         beside = ", though the other camera's clock may be the wrong one" if either else ""
-        doubts.append(
-            Doubt(
-                code="clock",
-                cameras=[name],
-                what=f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
-                f" {evidence[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}",
-                evidence={"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)},
-                remedy="" if beside else f"cameras.{name}.{offset}",
-            )
-        )
+        what = f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
+        what += f" {evidence[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}"
+        known = {"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)}
+        remedy = "" if beside else f"cameras.{name}.{offset}"
+        doubts.append(Doubt(code="clock", cameras=[name], what=what, evidence=dict(known), remedy=remedy))
     return doubts
 
 
@@ -255,40 +245,33 @@ def diagnose(
     if odd:
         tried += map(objective.scored, alternatives.discrete(trial))
         tried += map(objective.with_numbers, alternatives.numbers_of_all(trial))
-    if odd or objective.described.strain >= STRAINED:
+    is_strained = odd or objective.described.strain >= STRAINED
+    if is_strained:
         tried += map(objective.with_numbers, alternatives.numbers_of_one(trial))
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
-    if "size" in found.odd and (odd or objective.described.strain >= STRAINED):
+    if "size" in found.odd and is_strained:
         dearer = 0.0 if found.odd["size"].sigmas >= STRANGE_SIZE else MARGIN
-        tried += map(
-            objective.scored,
-            alternatives.scales(trial, solve(trial.described).joints, found.stature_m, dearer),
-        )
+        scales = alternatives.scales(trial, solve(trial.described).joints, found.stature_m, dearer)
+        tried += map(objective.scored, scales)
     # Times come last, since most of them need no exact score beside what fits by then.
     tried += map(objective.scored, alternatives.rates(trial))
-    tried += [
-        each
-        for index in trial.every
-        for each in (objective.best_clock([index]), objective.clock_of_rays(index))
-    ]
+    for index in trial.every:
+        tried += [objective.best_clock([index]), objective.clock_of_rays(index)]
     tried += [objective.best_clock(trial.every)] if odd and trial.moving else []
     causes, gained = _causes(objective, [each for each in tried if each is not None], odd)
     if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
         level = alternatives.level(trial, solve(trial.described).joints) if fits else ()
         causes = [Tried(each) for each in level] or causes or _below_zero(objective)
-    if (odd or objective.described.strain >= STRAINED) and not _is_explained(causes):
+    if is_strained and not _is_explained(causes):
         causes = _of_looks(trial, looks or {}) or causes
-    doubts = [
-        _doubt(trial, each, found, [cause.alternative.code for cause in causes if cause.score])
-        for each in causes
-    ]
+    codes = [cause.alternative.code for cause in causes if cause.score]
+    doubts = [_doubt(trial, each, found, codes) for each in causes]
     if doubts or strange or found.total >= DOUBTFUL or gained >= _WITHOUT_CAUSE:
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
         named |= {"clock"} if "frame_rate" in named else set()
-        doubts += [
-            each for each in _unusual_measures(trial, found, alone=not doubts) if each.code not in named
-        ]
+        unusual = _unusual_measures(trial, found, alone=not doubts)
+        doubts += [each for each in unusual if each.code not in named]
     return doubts
 
 
@@ -571,22 +554,14 @@ def _below_zero(objective: Objective) -> list[Tried]:
 
     Where all fly about equally high, the rays are alike with z upwards and downwards: no gain is asked for.
     """
-    trial = objective.trial
-    height = trial.described.position[trial.moving, :, 2]
+    trial, place = objective.trial, objective.trial.described.position
+    height = place[trial.moving, :, 2]
     if trial.located or not np.isfinite(height).any() or np.nanmax(height) > -_BELOW_M:
         return []
-    place = trial.described.position.copy()
-    place[trial.moving, :, 2] *= -1
-    turned = objective.scored(
-        Alternative(
-            "axes",
-            trial.names,
-            "all drones fly below zero: their positions count z downwards, or zero is high above the ground",
-            remedies.pose(trial.cameras, trial.moving, remedies.upside_down),
-            PRICE_OF_ALL,
-            replace(trial.described, position=place),
-        )
-    )
+    what = "all drones fly below zero: their positions count z downwards, or zero is high above the ground"
+    remedy = trial.lines(trial.moving, remedies.pose, remedies.upside_down)
+    below = trial.posed("axes", what, remedy, trial.described.rotation, place * [1.0, 1.0, -1.0])
+    turned = objective.scored(below)
     return [turned] if turned.total <= objective.base.total + _ALIKE + PRICE_OF_ALL else []
 
 
@@ -640,7 +615,7 @@ def _of_looks(trial: Trial, looks: Mapping[int, Callable[[], tuple[float, float]
     evidence = {f"aside_deg_{name}": angle for name, (angle, _) in degrees.items()}
     evidence |= {f"aside_sigma_deg_{name}": sigma for name, (_, sigma) in degrees.items()}
     what = f"the background shows that the camera looks elsewhere than logged: {angles}"
-    remedy = remedies.by_pictures(trial.cameras, list(found))
+    remedy = trial.lines(list(found), remedies.by_pictures)
     return [Tried(Alternative("mount", tuple(degrees), what, remedy, 0.0, evidence=evidence))] * bool(found)
 
 

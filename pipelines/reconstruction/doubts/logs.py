@@ -1,6 +1,6 @@
 """Doubts that the logs of a flight's cameras raise by themselves, without any picture."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import combinations
 
 import numpy as np
@@ -60,13 +60,14 @@ def doubt_of_unit(cameras: Mapping[str, Trajectory], units: Mapping[str, str | N
         unit = usual if widest_m * _UNITS_M[usual] < _TEAM_M else None
     if unit is None:
         return None
-    return Doubt(
-        code="unit",
-        cameras=list(cameras),
-        what=f"all cameras are {_length(widest_m)} apart: their positions are in {unit}",
-        evidence={"apart_m": round(widest_m, 4)},
-        remedy="; ".join(f"cameras.{name}.pose.unit: {unit}" for name in cameras),
-    )
+    apart = f"{100 * widest_m:.2g} cm" if widest_m < 1 else f"{widest_m / 1000:.2g} km"
+    what = f"all cameras are {apart} apart: their positions are in {unit}"
+    remedy = "; ".join(f"cameras.{name}.pose.unit: {unit}" for name in cameras)
+    return _doubt("unit", cameras, what, remedy, apart_m=round(widest_m, 4))
+
+
+def _doubt(code: str, cameras: Iterable[str], what: str, remedy: str, **evidence: float) -> Doubt:
+    return Doubt(code=code, cameras=list(cameras), what=what, evidence=dict(evidence), remedy=remedy)
 
 
 def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Float] | None) -> list[Doubt]:
@@ -80,30 +81,21 @@ def doubts_of_places(cameras: Mapping[str, Trajectory], map_box: tuple[Float, Fl
         if len(others) == 1 and np.linalg.norm(place[:2]) < np.linalg.norm(others[0][:2]):
             continue  # of two, the one that is farther from the origin
         unit = _unit(place, cameras[name], others)
-        reason = "its unit is another" if unit else _elsewhere(place)
-        remedy = f"unit: {unit}" if unit else "world_from_source: {translation: [east, north, up]}"
-        doubts.append(
-            Doubt(
-                code="unit" if unit else "origin",
-                cameras=[name],
-                what=f"{name} is far from the others: {reason}",
-                evidence={"apart_m": round(min(_apart_m(place, other) for other in others), 1)},
-                remedy=f"cameras.{name}.pose.{remedy}",
-            )
-        )
+        apart_m, what = min(_apart_m(place, other) for other in others), f"{name} is far from the others: "
+        if unit:
+            code, what, remedy = "unit", what + "its unit is another", f"unit: {unit}"
+        else:
+            what += _elsewhere(place)
+            code, remedy = "origin", "world_from_source: {translation: [east, north, up]}"
+        remedy = f"cameras.{name}.pose.{remedy}"
+        doubts.append(_doubt(code, [name], what, remedy, apart_m=round(apart_m, 1)))
     if map_box is not None:
         low, high = map_box
         away_m = min(_apart_m(place, np.clip(place, low, high)) for place in middle.values())
         if away_m > _ONE_FLIGHT_M:
-            doubts.append(
-                Doubt(
-                    code="origin",
-                    cameras=[],
-                    what=f"the map lies far from all cameras: {_elsewhere((low + high) / 2)}",
-                    evidence={"apart_m": round(away_m, 1)},
-                    remedy="map.crs: EPSG:32632  # that of its coordinates",
-                )
-            )
+            what = f"the map lies far from all cameras: {_elsewhere((low + high) / 2)}"
+            remedy = "map.crs: EPSG:32632  # that of its coordinates"
+            doubts.append(_doubt("origin", [], what, remedy, apart_m=round(away_m, 1)))
     return doubts
 
 
@@ -123,10 +115,6 @@ def _unit(place: Float, track: Trajectory, others: list[Float]) -> str | None:
 def _is_too_fast(track: Trajectory) -> bool:
     flown_m = float(np.linalg.norm(np.diff(track.position, axis=0), axis=1).sum())
     return flown_m / _TOO_FAST_MPS > float(track.t_ns[-1] - track.t_ns[0]) / 1e9
-
-
-def _length(length_m: float) -> str:
-    return f"{100 * length_m:.2g} cm" if length_m < 1 else f"{length_m / 1000:.2g} km"
 
 
 def _elsewhere(place: Float) -> str:
@@ -152,21 +140,15 @@ def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt |
     poses = [entry.poses for entry, _ in pair.values()]
     one_source = (poses[0].source, poses[0].topic) == (poses[1].source, poses[1].topic)
     if apart_m < _SAME_PATH_M and (turned_deg < _ONE_BODY_DEG or one_source):
-        return Doubt(
-            code="pose",
-            cameras=[first, second],
-            what=f"{first} and {second} fly the same path: one of them has the other's topic or log",
-            evidence={"apart_m": round(apart_m, 3), "turned_deg": round(turned_deg, 2)},
-            remedy=_topic({name: entry for name, (entry, _) in pair.items()}),
-        )
+        what = f"{first} and {second} fly the same path: one of them has the other's topic or log"
+        remedy = _topic({name: entry for name, (entry, _) in pair.items()})
+        turned_deg = round(turned_deg, 2)
+        return _doubt("pose", pair, what, remedy, apart_m=round(apart_m, 3), turned_deg=turned_deg)
     if starts_apart_m < _SAME_START_M and (apart_m > _SAME_START_M or turned_deg > _ONE_BODY_DEG):
-        return Doubt(
-            code="origin",
-            cameras=[first, second],
-            what=f"{first} and {second} start at the same place: each log counts from its own start",
-            evidence={"starts_apart_m": round(starts_apart_m, 3), "apart_m": round(apart_m, 3)},
-            remedy=f"cameras.{second}.pose.world_from_source: {{translation: [east, north, up]}}",
-        )
+        what = f"{first} and {second} start at the same place: each log counts from its own start"
+        remedy = f"cameras.{second}.pose.world_from_source: {{translation: [east, north, up]}}"
+        starts_apart_m = round(starts_apart_m, 3)
+        return _doubt("origin", pair, what, remedy, starts_apart_m=starts_apart_m, apart_m=round(apart_m, 3))
     return None
 
 

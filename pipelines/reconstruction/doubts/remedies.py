@@ -1,7 +1,9 @@
-"""The lines of flight.yaml that undo a mistake, as `cameras.drone1.clock: {offset_s: 0.3}`."""
+"""The lines of flight.yaml that undo a mistake, as `cameras.drone1.clock: {offset_s: 0.3}`.
 
-from collections.abc import Callable, Sequence
-from functools import cache
+Those of one camera leave out `cameras.NAME.` at the start; `lines` puts it there.
+"""
+
+from collections.abc import Callable, Iterable
 from io import StringIO
 from typing import Any, get_args
 
@@ -15,19 +17,28 @@ from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_mat
 from pipelines.reconstruction.observations import Filmed
 from pipelines.session.description import CameraEntry, PosesEntry
 
+Options = str | Callable[[PosesEntry], str]
+"""How poses are written, beside how they are read."""
+
 # A mount is turned by nothing unless a mistake says so.
 _EYE = np.eye(3)
 # Entries of equal rotation matrices differ by less than this.
 _SAME = 1e-3
 
 
-def _lines(cameras: Sequence[Filmed], group: Sequence[int], key_of: Callable[[Filmed], str]) -> str:
-    return "; ".join(f"cameras.{cameras[index].name}.{key_of(cameras[index])}" for index in group)
+def lines(cameras: Iterable[Filmed], line_of: Callable[..., str], *values: Any, **named: Any) -> str:
+    """Write the lines of some cameras: `line_of` makes that of each, from it and the values."""
+    return "; ".join(f"cameras.{camera.name}.{line_of(camera, *values, **named)}" for camera in cameras)
 
 
-def clock(cameras: Sequence[Filmed], group: Sequence[int], seconds: float) -> str:
-    """Move the clocks of cameras' pictures."""
-    return _lines(cameras, group, lambda camera: offset_of(camera.entry, seconds))
+def as_said(_: Filmed, line: str) -> str:
+    """Write the same line for each camera."""
+    return line
+
+
+def clock(camera: Filmed, seconds: float) -> str:
+    """Move the clock of a camera's pictures."""
+    return offset_of(camera.entry, seconds)
 
 
 def offset_of(entry: CameraEntry, seconds: float) -> str:
@@ -35,9 +46,11 @@ def offset_of(entry: CameraEntry, seconds: float) -> str:
     return f"clock.offset_s: {entry.clock.offset_s + seconds:.3f}"
 
 
-def frame_rate(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
-    """State the frame rate of cameras, whose pictures follow each other `factor` times as slowly."""
-    return _lines(cameras, group, lambda camera: f"frame_times.fps: {_rounded(rate_hz(camera) / factor)}")
+def frame_rate(camera: Filmed, factor: float) -> str:
+    """State the frame rate of a camera, whose pictures follow each other `factor` times as slowly."""
+    rate = rate_hz(camera) / factor
+    is_whole = abs(round(rate) - rate) < 0.005 * rate  # but for rounding
+    return f"frame_times.fps: {rate:.{0 if is_whole else 3}f}"
 
 
 def rate_hz(camera: Filmed) -> float:
@@ -45,117 +58,63 @@ def rate_hz(camera: Filmed) -> float:
     return camera.entry.frames.rate_hz or 1e9 / float(np.median(np.diff(camera.t_ns)))
 
 
-def _rounded(rate: float) -> str:
-    """Write a rate, as a whole number where it is that but for rounding."""
-    return f"{rate:.0f}" if abs(round(rate) - rate) < 0.005 * rate else f"{rate:.3f}"
-
-
 def earlier_or_later(seconds: float) -> str:
     """State by how much pictures were taken at another time than stated."""
     return f"{abs(seconds):.3f} s {'later' if seconds > 0 else 'earlier'} than stated"
 
 
-def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:
-    """Give cameras each other's pictures, or keypoints where those came with the flight."""
-
-    def key_of(camera: Filmed) -> str:
-        if camera.entry.keypoints is not None:
-            return f"keypoints.file: {camera.entry.keypoints.source}"
-        media = camera.entry.media
-        return f"video: {media.sources[0] if media and media.sources else camera.name}"
-
-    return "; ".join(
-        f"cameras.{cameras[index].name}.{key_of(cameras[other])}"
-        for index, other in enumerate(order)
-        if index != other
-    )
+def pictures_of(_: Filmed, owner: Filmed) -> str:
+    """Give a camera the pictures of their owner, or the keypoints where those came with the flight."""
+    if owner.entry.keypoints is not None:
+        return f"keypoints.file: {owner.entry.keypoints.source}"
+    media = owner.entry.media
+    return f"video: {media.sources[0] if media and media.sources else owner.name}"
 
 
-def mount(
-    cameras: Sequence[Filmed], group: Sequence[int], *, before: Float = _EYE, after: Float = _EYE
-) -> str:
-    """Turn body_from_camera [3, 3] of cameras in either's axes; without a mount what turns the pose."""
-
-    def key_of(camera: Filmed) -> str:
-        stored = camera.entry.poses.mount or camera.entry.poses.in_gimbal
-        if stored is None:
-            forwards = matrix_from_quaternion(body_from_camera("forward"))
-            rotation = quaternion_from_matrix(forwards.T @ before @ forwards @ after)
-            return f"pose.of: body; cameras.{camera.name}.mount: {_rigid([0.0, 0.0, 0.0], rotation)}"
-        rotation = before @ matrix_from_quaternion(np.array(stored.rotation_xyzw)) @ after
-        words = _as_words(rotation, stored.translation)
-        return f"mount: {words or _rigid(stored.translation, quaternion_from_matrix(rotation))}"
-
-    return _lines(cameras, group, key_of)
+def mount(camera: Filmed, *, before: Float = _EYE, after: Float = _EYE) -> str:
+    """Turn body_from_camera [3, 3] of a camera in either's axes; without a mount what turns the pose."""
+    stored = camera.entry.poses.mount or camera.entry.poses.in_gimbal
+    if stored is None:
+        forwards = matrix_from_quaternion(body_from_camera("forward"))
+        rotation = quaternion_from_matrix(forwards.T @ before @ forwards @ after)
+        return f"pose.of: body; cameras.{camera.name}.mount: {_rigid([0.0, 0.0, 0.0], rotation)}"
+    rotation = before @ matrix_from_quaternion(np.array(stored.rotation_xyzw)) @ after
+    for looks in get_args(Looks):
+        down_deg = 0.0 if looks in ("down", "up") else _down_deg(rotation)
+        if np.abs(matrix_from_quaternion(body_from_camera(looks, down_deg)) - rotation).max() < _SAME:
+            down = f", down_deg: {down_deg:.1f}" if abs(down_deg) >= 0.05 else ""
+            return f"mount: {{looks: {looks}{down}, translation: {_vector(stored.translation)}}}"
+    return f"mount: {_rigid(stored.translation, quaternion_from_matrix(rotation))}"
 
 
-def by_pictures(cameras: Sequence[Filmed], group: Sequence[int]) -> str:
-    """Let the films of cameras say how they turned, in place of logs, mounts and gimbals."""
-
-    def key_of(camera: Filmed) -> str:
-        poses = camera.entry.poses
-        if not (poses.mount or poses.in_gimbal or poses.gimbal):
-            return "pose.attitude: pictures"
-        others = "".join(f"; cameras.{camera.name}.{key}: null" for key in ("pose.of", "mount", "gimbal"))
-        return f"pose.attitude: pictures{others}"
-
-    return _lines(cameras, group, key_of)
+def by_pictures(camera: Filmed) -> str:
+    """Let the film of a camera say how it turned, in place of logs, mounts and gimbals."""
+    poses = camera.entry.poses
+    stated = ("pose.of", "mount", "gimbal") if poses.mount or poses.in_gimbal or poses.gimbal else ()
+    return "pose.attitude: pictures" + "".join(f"; cameras.{camera.name}.{key}: null" for key in stated)
 
 
 def down_deg(camera: Filmed) -> float:
     """Return by how much a camera's mount tilts it down; 0 without a mount, or where that is no tilt."""
     mount = camera.mount
-    if mount is None:
-        return 0.0
-    tilt = float(np.degrees(np.arcsin(np.clip(-mount[2, 2], -1, 1))))
-    return tilt if abs(mount[2, 0]) < _SAME else 0.0  # the picture's right is level
+    is_level = mount is not None and abs(mount[2, 0]) < _SAME  # the picture's right
+    return _down_deg(mount) if mount is not None and is_level else 0.0
 
 
-def _rigid(translation: Sequence[float], rotation_xyzw: Float) -> str:
+def _down_deg(mount: Float) -> float:
+    return float(np.degrees(np.arcsin(np.clip(-mount[2, 2], -1, 1))))
+
+
+def _rigid(translation: Iterable[float], rotation_xyzw: Float) -> str:
     numbers = ", ".join(f"{value:.6f}" for value in rotation_xyzw)
     return f"{{translation: {_vector(translation)}, rotation_xyzw: [{numbers}]}}"
 
 
-def _vector(values: Sequence[float]) -> str:
+def _vector(values: Iterable[float]) -> str:
     return "[" + ", ".join(f"{round(value, 3) + 0.0:.10g}" for value in values) + "]"
 
 
-def _as_words(rotation: Float, translation: Sequence[float]) -> str | None:
-    """State a mount as `looks` and `down_deg` where it is one."""
-    for looks, level in _levels().items():
-        tilt = level.T @ rotation
-        if abs(tilt[0, 0] - 1) > _SAME:
-            continue
-        angle = float(np.degrees(np.arctan2(tilt[2, 1], tilt[1, 1])))
-        for down_deg in (0.0,) if looks in ("down", "up") else (angle, -angle):
-            if abs(down_deg) > 90:
-                continue
-            same = matrix_from_quaternion(body_from_camera(looks, down_deg))
-            if np.abs(same - rotation).max() < _SAME:
-                down = f", down_deg: {down_deg:.1f}" if abs(down_deg) >= 0.05 else ""
-                return f"{{looks: {looks}{down}, translation: {_vector(translation)}}}"
-    return None
-
-
-@cache
-def _levels() -> dict[Looks, Float]:
-    """Return body_from_camera [3, 3] of every way to look, without a tilt."""
-    return {looks: matrix_from_quaternion(body_from_camera(looks)) for looks in get_args(Looks)}
-
-
-def turned_world(cameras: Sequence[Filmed], up: Float) -> str:
-    """Turn every source by the shortest rotation that brings a direction [3] upwards."""
-    quaternion = np.append(np.cross(up, [0.0, 0.0, 1.0]), 1.0 + up[2])
-    turn = matrix_from_quaternion(quaternion / np.linalg.norm(quaternion))
-    return _lines(cameras, range(len(cameras)), lambda camera: _placed(camera, np.zeros(3), turn))
-
-
-def scaled(cameras: Sequence[Filmed], factor: float) -> str:
-    """Scale the positions of every source of poses."""
-    return _lines(cameras, range(len(cameras)), lambda each: _placed(each, np.zeros(3), _EYE, factor))
-
-
-def _placed(camera: Filmed, shift: Float, turn: Float, factor: float = 1.0) -> str:
+def placed(camera: Filmed, shift: Float, turn: Float = _EYE, factor: float = 1.0) -> str:
     """State where the world of a log lies, turned [3, 3], moved [3] m and scaled from what is stated."""
     stated = camera.entry.poses.world_from_source
     half_rad = np.radians(stated.yaw_deg) / 2
@@ -174,14 +133,9 @@ def _placed(camera: Filmed, shift: Float, turn: Float, factor: float = 1.0) -> s
     return f"pose.world_from_source: {{{', '.join(parts or ['translation: [0, 0, 0]'])}}}"
 
 
-def pose(cameras: Sequence[Filmed], group: Sequence[int], options: str | Callable[[PosesEntry], str]) -> str:
-    """State how the poses of moving cameras are written, beside how they are read."""
-
-    def line(camera: Filmed) -> str:
-        stated = options if isinstance(options, str) else options(camera.entry.poses)
-        return "pose." + stated.format(camera.name)
-
-    return _lines(cameras, group, line)
+def inverse(poses: PosesEntry) -> str:
+    """State that poses are the inverses of what they are read as."""
+    return f"inverse: {str(not poses.inverse).lower()}"
 
 
 def upside_down(poses: PosesEntry) -> str:
@@ -196,55 +150,45 @@ OF_CAMERA = "of: camera; cameras.{}.mount: null"
 """The poses are those of the cameras, without a mount."""
 
 
-def keypoints_size(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
+def pose(camera: Filmed, options: Options) -> str:
+    """State how the poses of a camera are written, beside how they are read."""
+    stated = options if isinstance(options, str) else options(camera.entry.poses)
+    return "pose." + stated.format(camera.name)
+
+
+def keypoints_size(camera: Filmed, factor: float) -> str:
     """State the size of the pictures that keypoints are of; of film, calibrate the lens for its pictures."""
-
-    def key_of(camera: Filmed) -> str:
-        if camera.entry.keypoints is None:
-            return _lens(camera, factor, factor)
-        width, height = camera.intrinsics.width * factor, camera.intrinsics.height * factor
-        return f"keypoints.image_size: [{width:.0f}, {height:.0f}]"
-
-    return _lines(cameras, group, key_of)
+    if camera.entry.keypoints is None:
+        return lens(camera, factor, factor)
+    width, height = camera.intrinsics.width * factor, camera.intrinsics.height * factor
+    return f"keypoints.image_size: [{width:.0f}, {height:.0f}]"
 
 
-_MIRRORS = {
-    "false": frozenset[str](),
-    "true": frozenset({"x", "names"}),
-    "x": frozenset({"x"}),
-    "y": frozenset({"y"}),
-    "names": frozenset({"names"}),
-}
+MIRRORS = {"false": set[str](), "true": {"x", "names"}, "x": {"x"}, "y": {"y"}, "names": {"names"}}
+"""What of keypoints is mirrored, by the value of `keypoints.mirrored`."""
 
 
-def mirrored(cameras: Sequence[Filmed], group: Sequence[int], value: str) -> str:
+def mirrored(cameras: Iterable[Filmed], value: str) -> str:
     """State that keypoints are mirrored, besides what is stated of that: twice is not at all.
 
     No line does that for film, in which the keypoints are still to be found: it is turned over itself.
     """
-    lines = []
-    for index in group:
-        known, name = cameras[index].entry.keypoints, cameras[index].name
-        if known is None and value != "names":
+    found = []
+    for camera in cameras:
+        known, name = camera.entry.keypoints, camera.name
+        line = f"find the keypoints of {name} again, in its pictures as they are"
+        if known is not None:
+            parts = MIRRORS[value] ^ MIRRORS[str(known.mirrored).lower()]
+            needed = [key for key, each in MIRRORS.items() if each == parts]
+            line = f"cameras.{name}.keypoints.mirrored: {needed[0]}" if needed else line
+        elif value != "names":
             flip = "vflip" if value == "y" else "hflip"
-            lines.append(f"mirror the film of {name} back, as with `ffmpeg -i FILM -vf {flip} NEW`")
-            continue
-        parts = _MIRRORS[value] ^ _MIRRORS[str(known.mirrored if known else False).lower()]
-        needed = next((key for key, each in _MIRRORS.items() if each == parts), None) if known else None
-        lines.append(
-            f"cameras.{name}.keypoints.mirrored: {needed}"
-            if needed
-            else f"find the keypoints of {name} again, in its pictures as they are"
-        )
-    return "; ".join(lines)
+            line = f"mirror the film of {name} back, as with `ffmpeg -i FILM -vf {flip} NEW`"
+        found.append(line)
+    return "; ".join(found)
 
 
-def intrinsics(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
-    """Multiply the focal lengths of cameras."""
-    return _lines(cameras, group, lambda camera: _lens(camera, factor, 1.0))
-
-
-def _lens(camera: Filmed, focal: float, centre: float) -> str:
+def lens(camera: Filmed, focal: float, centre: float = 1.0) -> str:
     """State the intrinsics of a camera, with factors on the focal length and the principal point."""
     own = camera.intrinsics
     model = "" if own.model == "none" else f", model: {own.model}, distortion: {list(own.distortion)}"
@@ -254,30 +198,14 @@ def _lens(camera: Filmed, focal: float, centre: float) -> str:
     )
 
 
-def pose_noise(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
+def pose_noise(camera: Filmed, factor: float) -> str:
     """State errors of poses that are larger by a factor: constant ones, and those that change."""
-
-    def key_of(camera: Filmed) -> str:
-        sigma = factor * np.array(camera.sigma)
-        position, rotation = np.sqrt(np.maximum(sigma[:2] ** 2 - sigma[4:] ** 2, 0.0))
-        return (
-            f"pose_noise: {{bias: {{position_m: {position:.3g}, rotation_deg: {np.degrees(rotation):.3g}}},"
-            f" white: {{position_m: {sigma[4]:.3g}, rotation_deg: {np.degrees(sigma[5]):.3g}}}}}"
-        )
-
-    return _lines(cameras, [index for index in group if not cameras[index].static], key_of)
-
-
-def origin(cameras: Sequence[Filmed], index: int, shift: Float, yaw_rad: float = 0.0) -> str:
-    """Place the world of a camera's log in the flight's, beside what is stated of that already."""
-    turn = matrix_from_quaternion(np.array([0.0, 0.0, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)]))
-    return _lines(cameras, [index], lambda camera: _placed(camera, shift, turn))
-
-
-def own_origins(cameras: Sequence[Filmed], shifts: Float) -> str:
-    """Place the worlds of all logs, which are moved by `shifts` [C, 3] m."""
-    moved = [index for index in range(len(cameras)) if np.abs(shifts[index]).max() > 0]
-    return "; ".join(origin(cameras, index, shifts[index]) for index in moved)
+    sigma = factor * np.array(camera.sigma)
+    position, rotation = np.sqrt(np.maximum(sigma[:2] ** 2 - sigma[4:] ** 2, 0.0))
+    return (
+        f"pose_noise: {{bias: {{position_m: {position:.3g}, rotation_deg: {np.degrees(rotation):.3g}}},"
+        f" white: {{position_m: {sigma[4]:.3g}, rotation_deg: {np.degrees(sigma[5]):.3g}}}}}"
+    )
 
 
 def mended(text: str, remedy: str) -> str | None:
@@ -287,19 +215,12 @@ def mended(text: str, remedy: str) -> str | None:
     yaml.preserve_quotes, yaml.width = True, 10_000
     yaml.indent(mapping=mapping, sequence=mapping, offset=offset)
     document = yaml.load(text)
-    if not _are_set(document, remedy):
-        return None
-    yaml.dump(document, written)
-    return written.getvalue()
-
-
-def _are_set(document: Any, remedy: str) -> bool:
-    """Set the keys of a remedy; False if one is no key, or asks for what only the user knows."""
     for line in remedy.split("; "):
         path, _, value = line.partition(": ")
         keys, place = path.split("."), document
+        # It is no key, or asks for what only the user knows.
         if not value or keys[0] not in {"world", *document} or "..." in value:
-            return False
+            return None
         for key in keys[:-1]:
             if isinstance(place.get(key), str):
                 place[key] = {"file": place[key]}
@@ -307,4 +228,5 @@ def _are_set(document: Any, remedy: str) -> bool:
                 place[key] = {}
             place = place[key]
         place[keys[-1]] = YAML().load(value)
-    return True
+    yaml.dump(document, written)
+    return written.getvalue()

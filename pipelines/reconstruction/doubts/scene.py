@@ -14,7 +14,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import undistort
-from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
+from pipelines.geometry.noise import WHITE_SHARE, Drift, GaussMarkov, NoiseModel, White
 from pipelines.geometry.poses import interpolate_points
 from pipelines.reconstruction.observations import UNSTATED, Camera, Filmed, PoseSigma
 from pipelines.session.camera_poses import stated_models
@@ -34,6 +34,9 @@ JOINTS = (
 )
 """The joints that are looked at; every skeleton of people has most of them."""
 
+HIPS = [JOINTS.index("left_hip"), JOINTS.index("right_hip")]
+"""The indices of the hips among them."""
+
 MOMENTS = 60
 """Moments of the flight that are looked at, in pairs of `STEP_NS`."""
 
@@ -49,8 +52,6 @@ _CALIBRATED = (0.003, 0.001, 0.0, 0.0, 0.0, 0.0)  # of a still camera
 _LONGEST_GAP_NS = 250_000_000
 # A person chosen in a smaller share of the pictures with people is not the one to judge by.
 _CHOSEN_SHARE = 0.5
-# This share of a logged covariance is drawn anew in every pose.
-_NEW_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -105,16 +106,11 @@ class GroundOfMap(NamedTuple):
     def of(cls, occupancy: Occupancy) -> GroundOfMap:
         """Find the ground of a map."""
         occupied = occupancy.probability > 0.5
-        first = np.argmax(occupied, axis=2)
-        above = np.arange(occupied.shape[2]) >= first[..., None]
-        free_above = ~occupied & above
-        top = np.where(free_above.any(axis=2), np.argmax(free_above, axis=2), occupied.shape[2])
-        height = occupancy.origin[2] + top * occupancy.resolution_m
-        return cls(
-            np.asarray(occupancy.origin[:2], dtype=np.float64),
-            occupancy.resolution_m,
-            np.where(occupied.any(axis=2), height, np.nan),
-        )
+        above = np.logical_or.accumulate(occupied, axis=2)
+        free_above = np.pad(~occupied & above, ((0, 0), (0, 0), (0, 1)), constant_values=True)
+        height = occupancy.origin[2] + np.argmax(free_above, axis=2) * occupancy.resolution_m
+        known = np.where(occupied.any(axis=2), height, np.nan)
+        return cls(np.asarray(occupancy.origin[:2], dtype=np.float64), occupancy.resolution_m, known)
 
     def under(self, points: Float) -> Float:
         """Return the ground's height [N] under points [N, 3]; NaN beside the map."""
@@ -149,18 +145,12 @@ def sample(
             person whom a camera shows in most pictures.
         pose_noise: the value of `--pose-noise`, if any.
     """
-    filmed = tuple(
-        Filmed(
-            camera.name,
-            camera.intrinsics,
-            camera.frame_t_ns,
-            _pixels(camera, _most_seen(camera) if chosen is None else _chosen(camera, chosen[index])),
-            camera,
-            description.cameras[camera.name],
-            _sigma(camera, description.cameras[camera.name], pose_noise),
-        )
-        for index, camera in enumerate(cameras)
-    )
+    filmed = []
+    for index, camera in enumerate(cameras):
+        pixels = _pixels(camera, _most_seen(camera) if chosen is None else _chosen(camera, chosen[index]))
+        entry, t_ns = description.cameras[camera.name], camera.frame_t_ns
+        sigma = _sigma(camera, entry, pose_noise)
+        filmed.append(Filmed(camera.name, camera.intrinsics, t_ns, pixels, camera, entry, sigma))
     start = max(int(camera.t_ns[0]) for camera in filmed)
     end = min(int(camera.t_ns[-1]) for camera in filmed)
     if end - start <= STEP_NS:
@@ -168,7 +158,7 @@ def sample(
     before = np.linspace(start, end - 1.1 * STEP_NS, MOMENTS // 2).astype(np.int64)
     t_ns = np.sort(np.concatenate([before, before + STEP_NS]))
     return Sampled(
-        filmed,
+        tuple(filmed),
         description.pose_interpolation,
         t_ns,
         np.searchsorted(t_ns, before),
@@ -211,36 +201,29 @@ def _sigma(camera: Camera, entry: CameraEntry, pose_noise: str | None) -> PoseSi
     models = stated_models(camera.name, entry, pose_noise)
     if models is not None:
         length_s = float(np.ptp(camera.frame_t_ns)) / 1e9
-        parts = np.array([_variances(model, length_s) for model in models]).reshape(-1, 6)
-        return PoseSigma(*np.sqrt(parts.sum(axis=0)).tolist())
+        parts = sum((_variances(model, length_s) for model in models), np.zeros(6))
+        return PoseSigma(*np.sqrt(parts).tolist())
     if camera.sigma is not None:
         position, rotation = np.median(camera.sigma, axis=0).tolist()
-        share = float(np.sqrt(_NEW_SHARE))
-        new = (share * position, share * rotation)
+        new = float(np.sqrt(WHITE_SHARE)) * position, float(np.sqrt(WHITE_SHARE)) * rotation
         return PoseSigma(position, rotation, *new, *new)
     return PoseSigma(*(_CALIBRATED if camera.static else UNSTATED))
 
 
-def _variances(model: NoiseModel, length_s: float) -> list[float]:
+def _variances(model: NoiseModel, length_s: float) -> Float:
     """Return the variances [6] of a noise model in a flight, as in `PoseSigma`."""
-    match model:
-        case White():
-            white, varying = 1.0, 1.0
-        case GaussMarkov():
-            # Of the mean over a stretch: the integral of the autocorrelation.
-            steps = max(length_s / model.correlation_s, 1e-6)
-            white, varying = 0.0, 1 - 2 / steps * (1 + np.expm1(-steps) / steps)
-        case Bias():
-            white, varying = 0.0, 0.0
-        case Drift():
-            # A random walk has a mean variance of half its last one; a third of that is about its own mean.
-            level = length_s / 2
-            rates = np.array([model.position_m_per_sqrt_s, np.radians(model.rotation_deg_per_sqrt_s)])
-            return [*(level * rates**2), 0.0, 0.0, *(level / 3 * rates**2)]
-        case _:
-            return [0.0] * 6
-    squares = np.array([model.position_m, np.radians(model.rotation_deg)]) ** 2
-    return [*squares, *(white * squares), *(varying * squares)]
+    start_and_end, still = np.array([0.0, length_s]), np.zeros(2)
+    squares = np.mean(model.marginal_sigma(start_and_end, still, still) ** 2, axis=0)
+    white, varying = 0.0, 0.0
+    if isinstance(model, White):
+        white, varying = 1.0, 1.0
+    elif isinstance(model, GaussMarkov):
+        # Of the mean over a stretch: the integral of the autocorrelation.
+        steps = max(length_s / model.correlation_s, 1e-6)
+        varying = 1 - 2 / steps * (1 + float(np.expm1(-steps)) / steps)
+    elif isinstance(model, Drift):
+        varying = 1 / 3  # of the variance of a random walk, about its own mean
+    return np.concatenate([squares, white * squares, varying * squares])
 
 
 # --- the scene as described, and with other pixels and times -------------------------------------------
@@ -291,22 +274,13 @@ def scene_of(
         rays[index] = undistort(at, camera.intrinsics)
         row = at[..., 1]
         person_px.append(median(np.fmax.reduce(row, axis=1) - np.fmin.reduce(row, axis=1)))
-    position, rotation = (posed.position, posed.rotation) if posed else _poses(flight)
-    return SceneOfMoments(
-        rays,
-        position,
-        rotation,
-        np.array([(camera.intrinsics.fx + camera.intrinsics.fy) / 2 for camera in cameras]),
-        np.array([camera.sigma for camera in cameras]),
-        np.nan_to_num(np.array(person_px)),
-        np.array(unposed),
-        stated_ns,
+    poses = [] if posed else [camera.camera.poses_at(flight.t_ns, flight.between) for camera in cameras]
+    position, rotation = (
+        (posed.position, posed.rotation) if posed else map(np.array, zip(*poses, strict=True))
     )
-
-
-def _poses(flight: Sampled) -> tuple[Float, Float]:
-    posed = [camera.camera.poses_at(flight.t_ns, flight.between) for camera in flight.cameras]
-    return np.array([position for position, _ in posed]), np.array([rotation for _, rotation in posed])
+    focal_px = np.array([(camera.intrinsics.fx + camera.intrinsics.fy) / 2 for camera in cameras])
+    sigma, height_px = np.array([camera.sigma for camera in cameras]), np.nan_to_num(np.array(person_px))
+    return SceneOfMoments(rays, position, rotation, focal_px, sigma, height_px, np.array(unposed), stated_ns)
 
 
 def median(values: Float) -> float:
@@ -325,15 +299,15 @@ _FEWEST_MOMENTS = 20
 
 # Lengths of limbs over stature: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., fig. 4.1,
 # after Drillis and Contini 1964; from the middle of the hips to that of the shoulders for the torso.
-_LIMBS = (
-    ("left_hip", "left_knee", 0.245),
-    ("right_hip", "right_knee", 0.245),
-    ("left_knee", "left_ankle", 0.246),
-    ("right_knee", "right_ankle", 0.246),
-    ("left_shoulder", "left_elbow", 0.172),
-    ("right_shoulder", "right_elbow", 0.172),
-    ("left_elbow", "left_wrist", 0.150),
-    ("right_elbow", "right_wrist", 0.150),
+_LIMBS = tuple(
+    (f"{side}_{start}", f"{side}_{end}", share)
+    for start, end, share in (
+        ("hip", "knee", 0.245),
+        ("knee", "ankle", 0.246),
+        ("shoulder", "elbow", 0.172),
+        ("elbow", "wrist", 0.150),
+    )
+    for side in ("left", "right")
 )
 # The torso is so long as a share of the stature.
 _TORSO = 0.295
@@ -404,11 +378,17 @@ def size_sigmas(joints: Float) -> float:
 @np.errstate(invalid="ignore", divide="ignore")
 def trunk_direction(joints: Float) -> Float:
     """Return the mean [3] of the unit vectors from hips to shoulders; it is shorter if they vary."""
-    body = Body(joints)
-    trunk = body.shoulders - body.hips
-    trunk = trunk / np.linalg.norm(trunk, axis=-1, keepdims=True)
+    trunk = Body(joints).upwards
     known = trunk[np.isfinite(trunk).all(axis=-1)]
     return known.mean(axis=0) if len(known) > _FEWEST_MOMENTS else np.full(3, np.nan)
+
+
+def _unit(vectors: Float) -> Float:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _dot(one: Float, other: Float) -> Float:
+    return np.asarray((one * other).sum(axis=-1))
 
 
 class Body:
@@ -418,13 +398,24 @@ class Body:
         self.joints = joints
         self.hips = (self["left_hip"] + self["right_hip"]) / 2
         self.shoulders = (self["left_shoulder"] + self["right_shoulder"]) / 2
-        self.ankles = (self["left_ankle"] + self["right_ankle"]) / 2
-        upwards = self.shoulders - self.ankles
-        # Of the body, against the vertical.
-        self.cosine: Float = upwards[:, 2] / np.linalg.norm(upwards, axis=-1)
 
     def __getitem__(self, name: str) -> Float:
         return self.joints[:, _INDEX[name]]
+
+    @cached_property
+    def upwards(self) -> Float:
+        """Return the unit vectors [T, 3] from the hips to the shoulders."""
+        return _unit(self.shoulders - self.hips)
+
+    @cached_property
+    def forwards(self) -> Float:
+        """Return a vector [T, 3] to where the hips face, also of somebody who lies or is on their head."""
+        return np.cross(self.upwards, self["right_hip"] - self["left_hip"])
+
+    @cached_property
+    def cosine(self) -> Float:
+        """Return the cosine [T] of the body against the vertical."""
+        return _unit(self.shoulders - (self["left_ankle"] + self["right_ankle"]) / 2)[:, 2]
 
     @cached_property
     def lengths(self) -> list[tuple[Float, float]]:
@@ -467,9 +458,7 @@ class Body:
             "crossed": Oddity(max(0.0, 0.5 - same_sides) / 0.03, {"uncrossed_share": same_sides}),
             "bend": Oddity(max(0.0, 0.4 - bent) / 0.06, {"bent_forwards_share": bent}),
         }
-        forwards = self._forwards
-        forwards = forwards / np.linalg.norm(forwards, axis=-1, keepdims=True)
-        nose = ((self["nose"] - (self["left_ear"] + self["right_ear"]) / 2) * forwards).sum(axis=-1)
+        nose = _dot(self["nose"] - (self["left_ear"] + self["right_ear"]) / 2, _unit(self.forwards))
         wide = np.linalg.norm(self["left_ear"] - self["right_ear"], axis=-1)
         nose = nose[np.abs(nose) > _AHEAD_OF_EARS * wide]
         if len(nose) > _FEWEST_MOMENTS:
@@ -483,24 +472,17 @@ class Body:
         A knee is ahead of the line from hip to ankle, an elbow behind that from shoulder to wrist. What is
         hardly bent, or bent sideways, does not count; 1 where few are bent.
         """
-        upwards, forwards = (
-            each / np.linalg.norm(each, axis=-1, keepdims=True)
-            for each in (self.shoulders - self.hips, self._forwards)
-        )
-        shares = []
+        forwards, shares = _unit(self.forwards), []
         for root, middle, tip, sign in (("hip", "knee", "ankle", 1), ("shoulder", "elbow", "wrist", -1)):
             right: list[Bool] = []
             for side in ("left", "right"):
                 upper = self[f"{side}_{middle}"] - self[f"{side}_{root}"]
                 lower = self[f"{side}_{tip}"] - self[f"{side}_{middle}"]
-                upper_m, lower_m = np.linalg.norm(upper, axis=-1), np.linalg.norm(lower, axis=-1)
-                line = (upper + lower) / np.linalg.norm(upper + lower, axis=-1, keepdims=True)
-                apex = upper - (upper * line).sum(axis=-1, keepdims=True) * line
-                ahead = sign * (apex * forwards).sum(axis=-1) / np.linalg.norm(apex, axis=-1)
-                counts = (upper * lower).sum(axis=-1) / (upper_m * lower_m) < _BENT_COSINE
-                counts &= np.abs(ahead) > _CLEARLY
+                line = _unit(upper + lower)
+                ahead = sign * _dot(_unit(upper - _dot(upper, line)[:, None] * line), forwards)
+                counts = (_dot(_unit(upper), _unit(lower)) < _BENT_COSINE) & (np.abs(ahead) > _CLEARLY)
                 if middle == "elbow":
-                    counts &= -(upper * upwards).sum(axis=-1) / upper_m > _HANGING
+                    counts &= -_dot(_unit(upper), self.upwards) > _HANGING
                 right.append(ahead[counts] > 0)
             if sum(map(len, right)) > _FEWEST_MOMENTS:
                 shares.append(float(np.concatenate(right).mean()))
@@ -512,18 +494,9 @@ class Body:
             joint: self[f"right_{joint}"] - self[f"left_{joint}"]
             for joint in ("shoulder", "elbow", "hip", "knee")
         }
-        along = [
-            finite((across[one] * across[other]).sum(axis=-1))
-            for one, other in (("shoulder", "elbow"), ("hip", "knee"), ("shoulder", "hip"))
-        ]
+        pairs = (("shoulder", "elbow"), ("hip", "knee"), ("shoulder", "hip"))
+        along = [finite(_dot(across[one], across[other])) for one, other in pairs]
         return min((float((each > 0).mean()) for each in along if each.size > _FEWEST_MOMENTS), default=1.0)
-
-    @cached_property
-    def _forwards(self) -> Float:
-        """Return a vector [T, 3] to where the hips face, also of somebody who lies or is on their head."""
-        upwards = self.shoulders - self.hips
-        upwards /= np.linalg.norm(upwards, axis=-1, keepdims=True)
-        return np.cross(upwards, self["right_hip"] - self["left_hip"])
 
     def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, Oddity]:
         """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides.
@@ -587,10 +560,9 @@ class Body:
         first = np.arange(len(flight.t_ns))
         second = np.searchsorted(flight.t_ns, flight.t_ns + _WALK_NS, side="right") - 1
         step_s = (flight.t_ns[second] - flight.t_ns[first]) / 1e9
-        forwards = (self._forwards[first] + self._forwards[second])[:, :2]
-        forwards /= np.linalg.norm(forwards, axis=1, keepdims=True)
+        forwards = _unit((self.forwards[first] + self.forwards[second])[:, :2])
         moved = (self.hips[second] - self.hips[first])[:, :2]
-        along = (moved * forwards).sum(axis=1)
+        along = _dot(moved, forwards)
         across = forwards[:, 0] * moved[:, 1] - forwards[:, 1] * moved[:, 0]
         # Steps weigh by their squared length in time, as those of equal noise do; none faster than people.
         known = np.isfinite(along) & (np.hypot(along, across) < _FASTEST_MPS * step_s + 3 * white_m)

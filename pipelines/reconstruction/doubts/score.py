@@ -22,7 +22,7 @@ from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rot
 from pipelines.geometry.triangulation import MIN_PARALLAX_DEG
 from pipelines.reconstruction.doubts.scene import (
     FEW,
-    JOINTS,
+    HIPS,
     PLACED_M,
     SIZE_SIGMA,
     Body,
@@ -38,8 +38,8 @@ from pipelines.reconstruction.doubts.scene import (
 _KEYPOINT_PX = 3.0
 # Keypoints err by this share of the size of the person in the picture.
 _KEYPOINT_SHARE = 0.015
-# Joints are taken to be this far away before any distance is known.
-_FIRST_M = 10.0
+# Joints are taken to be this far away where no distance is known.
+_USUAL_M = 10.0
 _NEAREST_M, _FARTHEST_RAY_M = 1e-3, 1e5
 # A ray's angle to a joint that is nearer than this is not larger.
 _NEAR_M = 0.5
@@ -54,10 +54,8 @@ _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
 _PROBE = 1e-4
 # Residuals beyond this many standard deviations count linearly.
 _HUBER = 1.5
-# A person is filmed from about this distance where none is known.
-_USUAL_M = 10.0
-# With fewer rays nothing can be fitted.
-_FEWEST_RAYS = 60
+# With fewer rays or joints nothing can be said.
+_FEWEST = 60
 
 Make = Callable[[Float], SceneOfMoments]
 """A scene from the numbers [n] of an alternative."""
@@ -135,7 +133,7 @@ def _meet(
             if not seen[c, t, j]:
                 continue
             ray, along = direction[c, t, j], 0.0
-            away = min(max(abs(depth[c, t, j]), _NEAREST_M), _FARTHEST_RAY_M) if second else _FIRST_M
+            away = min(max(abs(depth[c, t, j]), _NEAREST_M), _FARTHEST_RAY_M) if second else _USUAL_M
             weight[c] = 1 / (away**2 * angle2[c] + place2[c])
             for i in range(3):
                 along += ray[i] * centre[c, t, i]
@@ -303,14 +301,11 @@ def _step(
     solved = solve(scene)
     used = solved.seen & (solved.views >= 2)
     unknowns = errors.size + len(numbers)
-    if used.sum() < _FEWEST_RAYS:
+    if used.sum() < _FEWEST:
         return np.inf, np.inf, np.zeros(unknowns), np.zeros((len(numbers), len(numbers)))
-    times = used.shape[1]
     joints, place = np.nan_to_num(solved.joints), np.nan_to_num(scene.position)
     missed, far = _misses(joints, place, solved.direction)
-    turned2 = pixel_variance(scene) / scene.focal_px**2
-    turned2 = (turned2 + _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times))[:, None, None]
-    moved2 = _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)[:, None, None]
+    turned2, moved2 = (each[:, None, None] for each in _changing2(scene))
     variance = turned2 + moved2 / far**2
     sigmas = np.linalg.norm(missed, axis=-1) / np.sqrt(variance)
     # One picture is one observation: its keypoints err alike.
@@ -341,7 +336,7 @@ def _step(
     # Each camera has its own errors; the numbers are shared by all.
     equations = -both.T @ solution
     for camera, own in enumerate(rows):
-        place_of = [*range(6 * camera, 6 * camera + 6), *range(errors.size, unknowns + 1)]
+        place_of = np.r_[6 * camera : 6 * camera + 6, errors.size : unknowns + 1]
         equations[np.ix_(place_of, place_of)] += own.T @ own
     # The person grows by what moves the joints away from their middle at each moment.
     known = np.isfinite(solved.joints).all(axis=2, keepdims=True)
@@ -360,16 +355,18 @@ def _step(
 
 def picture_variance(scene: SceneOfMoments) -> Float:
     """Return the variance [C] rad^2 of what a picture shows: keypoints, and errors of poses that change."""
-    times = scene.rays.shape[1]
-    turned2 = _varying2(scene.sigma[:, 5], scene.sigma[:, 3], times)
-    moved2 = _varying2(scene.sigma[:, 4], scene.sigma[:, 2], times)
-    return pixel_variance(scene) / scene.focal_px**2 + turned2 + moved2 / _USUAL_M**2
+    turned2, moved2 = _changing2(scene)
+    return turned2 + moved2 / _USUAL_M**2
 
 
-def _varying2(varying: Float, white: Float, times: int) -> Float:
-    """Return the variance [C] of errors that vary as of one picture; old parts are worth `FEW` pictures."""
-    lasting2 = np.maximum(varying**2 - white**2, 0.0)
-    return white**2 + lasting2 * times / FEW
+def _changing2(scene: SceneOfMoments) -> tuple[Float, Float]:
+    """Return variances [C], rad^2 of keypoints and turns and m^2 of places, of errors as of one picture.
+
+    Those that vary slowly are alike in pictures beside each other: all of them are worth `FEW` pictures.
+    """
+    white2, varying2 = scene.sigma[:, 2:4] ** 2, scene.sigma[:, 4:] ** 2
+    moved2, turned2 = (white2 + np.maximum(varying2 - white2, 0.0) * scene.rays.shape[1] / FEW).T
+    return pixel_variance(scene) / scene.focal_px**2 + turned2, moved2
 
 
 def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]:
@@ -377,14 +374,12 @@ def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]
     weight, pull = np.zeros(solved.views.shape), np.zeros(solved.joints.shape)
     if flight.hips is None:
         return weight, pull, 0.0
-    hips = [JOINTS.index("left_hip"), JOINTS.index("right_hip")]
-    apart = flight.hips[:, None] - solved.joints[:, hips]
+    apart = flight.hips[:, None] - solved.joints[:, HIPS]
     known = np.asarray(np.isfinite(apart).all(axis=-1))
     apart = np.where(known[..., None], apart, 0.0)
     # The way there counts besides the place: a log turned about its zero leads elsewhere.
     each = FEW / (PLACED_M**2 * max(int(known.sum()), 1))
-    weight[:, hips] = each * known
-    pull[:, hips] = each * apart
+    weight[:, HIPS], pull[:, HIPS] = each * known, each * apart
     return weight, pull, each * float((apart**2).sum())
 
 
@@ -393,13 +388,13 @@ def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]
 IMPOSSIBLE = 99.0
 """Score of a scene in which next to nothing is seen by two cameras."""
 
-_CHI2_MEDIAN = {1: 0.455, 3: 0.789, 5: 0.870}  # median of chi^2 over its degrees of freedom, by those
-# With more degrees of freedom, the median of chi-square over them is about this.
-_CHI2_MEDIAN_MORE = 0.9
+_CHI2_MEDIAN = {
+    1: 0.455,
+    3: 0.789,
+    5: 0.870,
+}  # median of chi^2 over its degrees of freedom, by those; else 0.9
 # A joint that is farther away does not tell how far stated errors move it.
 _FARTHEST_M = 30.0
-# With fewer joints that two cameras see in all moments nothing can be said.
-_FEWEST = 60
 # Rays that cross by less than this sine tell no distance.
 _PARALLEL = 0.15
 # Ankles of somebody who stands are this high above the ground.
@@ -513,8 +508,7 @@ def _misfit(solved: SolvedJoints, good: Bool) -> float:
     total = 0.0
     for value in np.unique(freedom[good]):
         among = good & (freedom == value)
-        usual = _CHI2_MEDIAN.get(int(value), _CHI2_MEDIAN_MORE)
-        total += among.sum() * median(solved.chi2[among]) / value / usual
+        total += among.sum() * median(solved.chi2[among]) / value / _CHI2_MEDIAN.get(int(value), 0.9)
     return float(np.sqrt(total / good.sum()))
 
 
@@ -529,25 +523,19 @@ def _rays(solved: SolvedJoints, good: Bool, misfit: float) -> dict[str, Oddity]:
         if both.any():
             cosine = (solved.direction[one][both] * solved.direction[other][both]).sum(axis=-1)
             sine = max(sine, median(np.sqrt(np.maximum(0.0, 1.0 - cosine**2))))
+    parallel, parallax_deg = max(0.0, 0.1 / max(sine, 1e-4) - 1), float(np.degrees(np.arcsin(sine)))
     return {
-        "parallax": Oddity(
-            max(0.0, 0.1 / max(sine, 1e-4) - 1), {"parallax_deg": float(np.degrees(np.arcsin(sine)))}
-        ),
+        "parallax": Oddity(parallel, {"parallax_deg": parallax_deg}),
         "unused": Oddity(max(0.0, unused - _USUALLY_UNUSED) / 0.05, {"unused_share": unused}),
     }
 
 
 def _scatter(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
     """Fit constant errors of two poses to the rays' distances, and measure what they leave over the noise."""
-    shape, two = solved.seen.shape[1:], list(pair)
+    shape, pixel2 = solved.seen.shape[1:], pixel_variance(scene) / scene.focal_px**2
+    two, views = list(pair), (scene.position, scene.rotation, scene.sigma, pixel2)
     used, design, apart, noise2 = _crossings(
-        solved.direction[two],
-        solved.depth[two],
-        solved.seen[two],
-        scene.position[two],
-        scene.rotation[two],
-        scene.sigma[two],
-        (pixel_variance(scene) / scene.focal_px**2)[two],
+        solved.direction[two], solved.depth[two], solved.seen[two], *(each[two] for each in views)
     )
     if len(used) < _FEWEST:
         return None

@@ -73,10 +73,8 @@ def turns_of(camera: Camera, followed: Followed) -> Turns:
     t_ns = camera.frame_t_ns[followed.rows]
     step_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf
     span = max(1, round(_SPAN_NS / step_ns))
-    last = len(followed.parts) - 1
-    chosen = (
-        np.unique(np.linspace(0, last, _MOST_PARTS).astype(np.intp)) if last >= 0 else np.empty(0, np.intp)
-    )
+    count = len(followed.parts)
+    chosen = np.unique(np.linspace(0, max(count - 1, 0), _MOST_PARTS).astype(np.intp))[:count]
     first: list[int] = []
     pairs: list[tuple[Float, Float]] = []
     for place, index in enumerate(chosen):
@@ -101,7 +99,7 @@ def turns_of(camera: Camera, followed: Followed) -> Turns:
 
 
 def _turned(before: Float, after: Float, logged: Float, moved: Float) -> Float:
-    """Return rotation vectors [N, 3] that bring rays [N, K, 3] onto others, beside what is logged."""
+    """Return rotations [N, 3, 3] that bring rays [N, K, 3] onto others, beside what is logged."""
     # Where the camera moved, a point tells the turn across that motion alone: its distance is unknown.
     far = np.linalg.norm(moved, axis=1, keepdims=True) > _BASELINE_M
     normal = np.cross(np.where(far, moved, [1.0, 0.0, 0.0])[:, None], after)
@@ -116,11 +114,12 @@ def _turned(before: Float, after: Float, logged: Float, moved: Float) -> Float:
         left = np.abs(miss - (design @ step)[..., 0])
         usual = _HUBER * (1.48 * np.median(left, axis=1, keepdims=True) + 1e-6)
         weight = 1 / np.maximum(left / usual, 1.0)
-    return _vectors(turn)
+    return turn
 
 
-def _vectors(rotation: Float) -> Float:
-    return rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
+def _angles(rotation: Float) -> Float:
+    vectors = rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
+    return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
 def lateness(
@@ -136,32 +135,32 @@ def lateness(
     first picture that was looked at). None is returned if too little turns, or the logs turn otherwise at all
     times.
     """
-    known = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
     starts = [int(each.frame_t_ns[0]) for each in cameras] if first_ns is None else first_ns
     times = [*((float(s), 1.0) for s in _GRID_S), *((0.0, factor) for factor in factors)]
-    curves = {i: _gains(cameras[i], found, between, times, start_ns=starts[i]) for i, found in known.items()}
-    groups: list[tuple[int, ...]] = [(i,) for i in known]
-    groups += [tuple(known)] if 0 < len(known) == len(cameras) > 1 else []
-    tried: list[Lateness | None] = []
+    curves = {i: _gains(cameras[i], found, between, times, start_ns=starts[i]) for i, found in turns.items()}
+    groups = [*((i,) for i in turns), *([tuple(turns)] if len(turns) == len(cameras) > 1 else [])]
+    tried: list[Lateness] = []
     for group in groups:
-        tried.append(_best_clock(group, _GRID_S, [curves[i][: len(_GRID_S)] for i in group]))
-        for place, factor in enumerate(factors, start=len(_GRID_S)):
-            gain, explained = _summed([curves[i][place] for i in group])
-            tried.append(Lateness(group, 0.0, factor, gain, float("nan")) if explained else None)
-    return sorted((each for each in tried if each is not None), key=lambda each: -each.gain)
+        clocks, rates = np.split(np.sum([curves[i] for i in group], axis=0), [len(_GRID_S)])
+        clock = _best_clock(group, _GRID_S, clocks)
+        tried += [] if clock is None else [clock]
+        tried += [
+            Lateness(group, 0.0, factor, float(gain), float("nan"))
+            for factor, gain in zip(factors, _explained(rates), strict=True)
+            if np.isfinite(gain)
+        ]
+    return sorted(tried, key=lambda each: -each.gain)
 
 
 def common_offset(
     cameras: Sequence[Camera], followed: Mapping[str, object], between: Interpolation
 ) -> Lateness | None:
     """Estimate the clock offset that all cameras share by their backgrounds; None if it is not sure."""
-    turns = all_turns(cameras, followed)
-    turns = {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
-    late = None
+    turns, late = all_turns(cameras, followed), None
     for grid in (_GRID_S, _FINE_STEP_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1, dtype=np.float64)):
         at: Float = grid if late is None else grid + late.late_s
         curves = [_gains(cameras[i], each, between, [(s, 1.0) for s in at]) for i, each in turns.items()]
-        found = _best_clock(tuple(range(len(cameras))), at, curves) if curves else None
+        found = _best_clock(tuple(range(len(cameras))), at, np.sum(curves, axis=0)) if curves else None
         if late is not None and found is not None:
             return replace(late, late_s=found.late_s)
         late = late or found
@@ -171,12 +170,10 @@ def common_offset(
 
 
 def all_turns(cameras: Sequence[Camera], followed: Mapping[str, object]) -> dict[int, Turns]:
-    """Choose the turns of the cameras whose backgrounds were followed, by index."""
-    return {
-        index: turns_of(camera, tracks)
-        for index, camera in enumerate(cameras)
-        if isinstance(tracks := followed.get(camera.name), Followed)
-    }
+    """Choose the turns of the cameras whose followed backgrounds show enough of them, by index."""
+    tracks = {index: followed.get(camera.name) for index, camera in enumerate(cameras)}
+    turns = {i: turns_of(cameras[i], each) for i, each in tracks.items() if isinstance(each, Followed)}
+    return {index: found for index, found in turns.items() if len(found.before) >= _FEWEST_TURNS}
 
 
 def is_sure_clock(late: Lateness) -> bool:
@@ -191,8 +188,11 @@ def _gains(
     times: Sequence[tuple[float, float]],
     *,
     start_ns: int = 0,
-) -> list[tuple[float, float, float]]:
-    """Return by how much other times (added s, factor) lower the chi^2; the squares left, those of turns."""
+) -> Float:
+    """Return by how much other times lower the chi^2, the squares left, and those of turns [S, 3].
+
+    Times are seconds that are added, and a factor.
+    """
     # The level of the logs' errors is estimated: N log of the ratio of mean squares.
     stated, _ = _left(camera, turns, between, turns.first_ns, turns.second_ns)
     found = []
@@ -208,9 +208,9 @@ def _gains(
             continue
         angles = np.stack([each[both] for each in (stated, left, logged)])
         usual = np.minimum(angles, np.quantile(angles, _USUAL_SHARE, axis=1, keepdims=True))
-        squares = (np.mean(usual**2, axis=1) + 1e-12).tolist()
-        found.append((float(both.sum() * np.log(squares[0] / squares[1])), squares[1], squares[2]))
-    return found
+        squares = np.mean(usual**2, axis=1) + 1e-12
+        found.append((both.sum() * np.log(squares[0] / squares[1]), squares[1], squares[2]))
+    return np.array(found)
 
 
 def _left(
@@ -224,24 +224,19 @@ def _left(
     moved = np.einsum("nij,nj->ni", back, start - end)
     known = np.isfinite(logged).all(axis=(1, 2)) & np.isfinite(moved).all(axis=1)
     left, turned = np.full((2, len(logged)), np.nan)
-    found = _turned(turns.before[known], turns.after[known], logged[known], moved[known])
-    left[known] = np.linalg.norm(found, axis=1)
-    turned[known] = np.linalg.norm(_vectors(logged[known]), axis=1)
+    left[known] = _angles(_turned(turns.before[known], turns.after[known], logged[known], moved[known]))
+    turned[known] = _angles(logged[known])
     return left, turned
 
 
-def _summed(found: Sequence[tuple[float, float, float]]) -> tuple[float, bool]:
-    """Add the gains of cameras; say if their logs turn mostly as the pictures do."""
-    gain, left, turned = (sum(column) for column in zip(*found, strict=True))
-    return gain, left <= _UNEXPLAINED * turned
+def _explained(summed: Float) -> Float:
+    """Return the gains [S] of times; -inf where the logs do not turn mostly as the pictures do."""
+    return np.where(summed[:, 1] <= _UNEXPLAINED * summed[:, 2], summed[:, 0], -np.inf)
 
 
-def _best_clock(
-    group: tuple[int, ...], grid: Float, curves: Sequence[Sequence[tuple[float, float, float]]]
-) -> Lateness | None:
+def _best_clock(group: tuple[int, ...], grid: Float, summed: Float) -> Lateness | None:
     """Find the best clock of a group on a grid [S] of seconds, between its values by a parabola."""
-    summed = [_summed(each) for each in zip(*curves, strict=True)]
-    gains = np.array([gain if explained else -np.inf for gain, explained in summed])
+    gains = _explained(summed)
     best = int(np.argmax(gains))
     if not np.isfinite(gains[best]):
         return None
