@@ -41,8 +41,8 @@ SAME_RANGE_M = 0.3
 # The field counts a joint as right within this distance (PCK at 150 mm).
 PCK_M = 0.15
 # Modelled differences are off from filmed ones by this (RMS, fifteen worlds of `benchmarks.planner films`).
-# Detectors mistake who is hidden: where fewer joints are within `PCK_M`, those that are measured err more.
-MODEL_SIGMA_MM, MODEL_SIGMA_MM_PER_POINT, MODEL_SIGMA_POINTS = 8.0, 1.5, 5.0
+# Detectors mistake who is hidden: for each point less of `coverage`, what is measured is off by the second.
+MODEL_SIGMA_MM, MODEL_SIGMA_MM_PER_HIDDEN, MODEL_SIGMA_POINTS = 8.0, 1.5, 5.0
 # Student's factor for many draws.
 _TWO_SIDED = 1.96
 
@@ -124,8 +124,8 @@ def figures_of(
     }
     if less is not None and t_ns is None:
         near = [float((np.abs(arm.error_m - PCK_M) <= MODEL_SIGMA_MM / 1e3).mean()) for arm in arms]
-        apart_points = 100 * (figures["pck150"] or {"mean": 0.0})["mean"]
-        _widen(figures["mpjpe_mm"], float(np.hypot(MODEL_SIGMA_MM, MODEL_SIGMA_MM_PER_POINT * apart_points)))
+        hidden = 100 * (figures["coverage"] or {"mean": 0.0})["mean"]
+        _widen(figures["mpjpe_mm"], float(np.hypot(MODEL_SIGMA_MM, MODEL_SIGMA_MM_PER_HIDDEN * hidden)))
         # Where many joints err by about 150 mm, a few millimetres are many points.
         _widen(figures["pck150"], float(np.hypot(MODEL_SIGMA_POINTS / 100, np.mean(near) / 2)))
     return figures
