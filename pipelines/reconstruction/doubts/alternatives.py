@@ -47,9 +47,6 @@ PRICE_OF_ALL = 0.5
 PRICE_OF_ONE = 0.8
 """Price of an alternative of one camera, of which there are as many as cameras."""
 
-LEAST_SIGMAS = 5.0
-"""A stated value is doubted beyond this many of its standard deviations, because errors have heavy tails."""
-
 _FLU_FROM_OPTICAL, _FLU_FROM_FRD, _ENU_FROM_NED = (
     matrix_from_quaternion(each).round() for each in (body_from_camera("forward"), FLU_FROM_FRD, ENU_FROM_NED)
 )
@@ -62,6 +59,8 @@ _USUAL_RATES_HZ, _SAME_RATE = (24.0, 25.0, 30.0, 50.0, 60.0), 2e-3
 _PRICE_OF_UNUSUAL_RATE = 1.0
 # Logs go on about as long as pictures: a rate pays this, times the share of logs that it leaves unfilmed.
 _PRICE_OF_UNFILMED = 3.0
+# A stated value is doubted beyond this many of its standard deviations, because errors have heavy tails.
+_LEAST_SIGMAS = 5.0
 # A fitted number that is nearer to zero, in its own standard deviations, may be zero.
 _LEAST_OWN_SIGMAS = 3.0
 # Smaller faults do not matter beside the errors of good poses, whatever is stated of these.
@@ -183,11 +182,16 @@ class Trial:
         scene = replace(self.described, rotation=turned, position=moved)
         return Alternative(code, names, what, remedy, price, scene, same_scatter)
 
-    def with_pixels(self, group: Sequence[int], change: Callable[[Float, Filmed], Float]) -> SceneOfMoments:
-        """Change the pixels [F, J, 2] of cameras."""
-        pixels = [camera.pixels for camera in self.cameras]
+    def with_pixels(
+        self, group: Sequence[int], factor: float = 1.0, mirrored: Set[str] = frozenset()
+    ) -> SceneOfMoments:
+        """Enlarge the pixels of cameras; mirror their `x` or `y`, or the `names` of left and right joints."""
+        pixels, both = [camera.pixels for camera in self.cameras], ["x" in mirrored, "y" in mirrored]
         for index in group:
-            pixels[index] = change(pixels[index], self.cameras[index])
+            own = self.cameras[index].intrinsics
+            last = np.array([own.width, own.height]) - 1
+            other = np.where(both, last - pixels[index], factor * pixels[index])
+            pixels[index] = other[:, _LEFT_RIGHT] if "names" in mirrored else other
         return scene_of(self.flight, self.described, pixels=pixels)
 
 
@@ -372,9 +376,9 @@ def discrete(trial: Trial) -> Iterator[Alternative]:
             poses = trial.cameras[index].entry.poses
             written.setdefault((Path(poses.source).suffix.lower(), poses.topic is None), []).append(index)
         kinds: list[list[int] | None] = [None, *(written.values() if len(written) > 1 else ())]
-        each = [[index] for index in trial.moving if len(trial.moving) > 1 and [index] not in kinds]
+        kinds += [[index] for index in trial.moving if len(trial.moving) > 1 and [index] not in kinds]
         yield from chain(_mounts(trial), _gimbals(trial), *(_conventions(trial, kind) for kind in kinds))
-        yield from chain(*(_units(trial, kind) for kind in [*kinds, *each]))
+        yield from chain(*(_units(trial, kind) for kind in kinds))
     yield from _keypoints(trial)
     price = PRICE_OF_ALL + np.log(len(_FOCAL_FACTORS)) / 2
     for factor in _FOCAL_FACTORS:
@@ -402,13 +406,13 @@ def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
 def _mounts(trial: Trial) -> Iterator[Alternative]:
     """Try cameras that are rolled, or look another way, by right angles, and the other sign of tilts."""
     rotation, mounts = trial.described.rotation, trial.mounts
-    for (group, price), degrees in product(trial.groups(trial.moving), (90, 180, -90)):
-        turn, whose = turn_about("z", degrees), trial.whose(group)
-        rolled = f"{whose} is rolled by {degrees} deg about the optical axis"
+    for (group, price), degrees in product(trial.groups(trial.moving), (90, 180, 270)):
+        turn, whose, signed = turn_about("z", degrees), trial.whose(group), (degrees + 179) % 360 - 179
+        rolled = f"{whose} is rolled by {signed} deg about the optical axis"
         remedy = trial.lines(group, remedies.mount, after=turn)
         yield trial.posed("mount", rolled, remedy, rotation @ turn, group=group, price=price)
-        side, aside = "left" if degrees > 0 else "right", rotation @ mounts.mT @ turn @ mounts
-        what = f"{whose} is mounted {abs(degrees)} deg to the {side} of where it is said to look"
+        side, aside = "left" if signed > 0 else "right", rotation @ mounts.mT @ turn @ mounts
+        what = f"{whose} is mounted {abs(signed)} deg to the {side} of where it is said to look"
         remedy = trial.lines(group, remedies.mount, before=turn)
         yield trial.posed("mount", what, remedy, aside, group=group, price=price)
     down = {index: remedies.down_deg(trial.cameras[index]) for index in trial.moving}
@@ -450,7 +454,7 @@ def _gimbals(trial: Trial) -> Iterator[Alternative]:
             group.append(index)
         rows += [(group, stated, f"relative_to: {meant}", turned)] if group else []
     for group, what, line, turned in rows:
-        remedy = trial.lines(group, remedies.as_said, f"gimbal.{line}")
+        remedy = "; ".join(f"cameras.{name}.gimbal.{line}" for name in trial.named(group))
         yield trial.posed("gimbal", f"the gimbals' angles are {what}", remedy, turned, group=group)
 
 
@@ -467,7 +471,7 @@ def _frames(body: Float) -> dict[str, Float]:
 def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternative]:
     """Try other meanings of the logged poses: axes, inverses, orders of quaternions.
 
-    `kind` are the cameras with logs of one kind; None for all that move.
+    `kind` are the cameras with logs of one kind, or one camera; None for all that move.
     """
     moving = trial.moving if kind is None else kind
     price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
@@ -562,23 +566,13 @@ def _keypoints(trial: Trial) -> Iterator[Alternative]:
         for factor in _SIZE_FACTORS:
             what = f"the keypoints{whose} are of pictures {1 / factor:.3g} times as large"
             remedy = trial.lines(group, remedies.keypoints_size, 1 / factor)
-            scene = trial.with_pixels(group, partial(_enlarged, factor))
+            scene = trial.with_pixels(group, factor)
             yield Alternative("keypoints_size", named, what, remedy, price, scene)
         for value, (of_all, dearer, what) in _MIRRORED.items():
             if not (one and of_all):
-                scene = trial.with_pixels(group, partial(_mirrored, remedies.MIRRORS[value]))
+                scene = trial.with_pixels(group, mirrored=remedies.MIRRORS[value])
                 remedy = remedies.mirrored([trial.cameras[index] for index in group], value)
                 yield Alternative("mirrored", named, what.format(whose), remedy, price + dearer, scene)
-
-
-def _enlarged(factor: float, pixels: Float, _: Filmed) -> Float:
-    return pixels * factor
-
-
-def _mirrored(parts: Set[str], pixels: Float, own: Filmed) -> Float:
-    last = np.array([own.intrinsics.width, own.intrinsics.height]) - 1
-    mirrored = np.where(["x" in parts, "y" in parts], last - pixels, pixels)
-    return mirrored[:, _LEFT_RIGHT] if "names" in parts else mirrored
 
 
 # --- alternatives with numbers, which are fitted ---------------------------------------------------------
@@ -591,6 +585,19 @@ NUMBERS = {"shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 
 focal length is another; the number is then the logarithm of the factor.
 """
 
+# The code and the sentence of each.
+_FAULTS = {
+    "shift": ("origin", "the log of {whose} has its zero {far_m:.1f} m from the world's"),
+    "north": ("origin", "the log of {whose} has its north {degrees:+.0f} deg from the world's"),
+    "zero": (
+        "origin",
+        "the log of {whose} has its zero {far_m:.1f} m and its north {degrees:+.0f} deg from the world's",
+    ),
+    "heading": ("pose", "the heading of {whose} is {degrees:+.0f} deg from what is logged"),
+    "pitch": ("mount", "{whose} looks {tilt} than stated"),
+    "roll": ("mount", "{whose} is rolled by {degrees:+.0f} deg about the optical axis"),
+    "focal": ("intrinsics", "the focal length of {whose} is {factor:.3g} times what is stated"),
+}
 # Prices of what all cameras have in common. Right positions with headings that are all wrong are rare.
 _OF_ALL = {"focal": PRICE_OF_ALL, "pitch": PRICE_OF_ALL, "heading": 3.0}
 # A fit finds the best angle from within some 10 deg; those that are not here are tried all around.
@@ -656,7 +663,7 @@ def _is_fault(trial: Trial, kind: str, group: Sequence[int], numbers: Float, cov
         return False
     if kind == "focal":
         return abs(float(numbers[0])) >= _LEAST_ZOOM
-    position_m, rotation_rad = LEAST_SIGMAS * trial.described.sigma[list(group), :2].max(axis=0)
+    position_m, rotation_rad = _LEAST_SIGMAS * trial.described.sigma[list(group), :2].max(axis=0)
     shifts = numbers[: len(numbers) // 3 * 3].reshape(-1, 3)
     least_m = np.linalg.norm(shifts, axis=1).min(initial=np.inf)
     turn_rad = abs(float(numbers[-1])) if kind != "shift" else 0.0
@@ -679,25 +686,12 @@ def _of_numbers(
     """State fitted numbers and their remedy; None if they are too small to matter."""
     if not _is_fault(trial, kind, group, numbers, covariance):
         return None
-    whose, number, variance = trial.whose(group), float(numbers[-1]), np.diag(covariance)
+    number, variance, (code, sentence) = float(numbers[-1]), np.diag(covariance), _FAULTS[kind]
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
     shift = numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
-    far = f"{np.linalg.norm(shift):.1f} m"
-    code, what = {
-        "shift": ("origin", f"the log of {whose} has its zero {far} from the world's"),
-        "north": ("origin", f"the log of {whose} has its north {degrees:+.0f} deg from the world's"),
-        "zero": (
-            "origin",
-            f"the log of {whose} has its zero {far} and its north {degrees:+.0f} deg from the world's",
-        ),
-        "heading": ("pose", f"the heading of {whose} is {degrees:+.0f} deg from what is logged"),
-        "pitch": (
-            "mount",
-            f"{whose} looks {abs(degrees):.0f} deg {'higher' if degrees > 0 else 'lower'} than stated",
-        ),
-        "roll": ("mount", f"{whose} is rolled by {degrees:+.0f} deg about the optical axis"),
-        "focal": ("intrinsics", f"the focal length of {whose} is {zoom(number):.3g} times what is stated"),
-    }[kind]
+    measured = {"far_m": np.linalg.norm(shift), "degrees": degrees, "factor": zoom(number)}
+    tilt = f"{abs(degrees):.0f} deg {'higher' if degrees > 0 else 'lower'}"
+    what = sentence.format(whose=trial.whose(group), tilt=tilt, **measured)
     turn = turn_about("x" if kind == "pitch" else "z", degrees)
     if kind == "focal":
         remedy = trial.lines(group, remedies.lens, zoom(number))

@@ -19,7 +19,6 @@ from pipelines.geometry.arrays import Float, Int64
 from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.doubts import alternatives, remedies
 from pipelines.reconstruction.doubts.alternatives import (
-    LEAST_SIGMAS,
     PRICE_OF_ALL,
     RATES,
     Alternative,
@@ -47,13 +46,7 @@ from pipelines.reconstruction.doubts.score import (
     surprise,
     unposed,
 )
-from pipelines.reconstruction.doubts.turning import (
-    LEAST_GAIN,
-    Lateness,
-    all_turns,
-    is_sure_clock,
-    lateness,
-)
+from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
 from pipelines.reconstruction.loading import load_truth
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description, Doubt, Interpolation
@@ -63,36 +56,26 @@ from pipelines.session.people import logged_actor
 TIMES = ("clock", "frame_rate")
 """Codes of what is tried on every flight."""
 
-LEAST_GAIN_OF_TIMES = 1.0
-"""Score that clocks and frame rates must gain to be scored exactly: half of what their margin asks."""
-
-MARGIN = 3.0
-"""By how much an alternative must lower the objective, beyond its price, to be named."""
-
-COST_OF_SCORE = 4.7
-"""Chi^2 that counts as much as one of the score."""
-
-ODD = 3.0
-"""Score of a description from which more than times is tried."""
-
-SCATTERED = 0.65
-"""Scatter of rays from which more than times is tried, whatever the score; 0.35 to 0.7 on right flights."""
-
-MISSED = 1.8
-"""Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights."""
-
-STRAINED = 10.0
-"""Chi^2 of constant errors of poses from which numbers of one camera are tried."""
-
-STRANGE = 5.0
-"""Standard deviations from which a single unusual measure is a doubt at any score."""
-
-STRANGE_SIZE = 2.5
-"""The same of the stature: mistakes of scale are less rare than people below 1.27 m or above 2.12 m."""
-
-DOUBTFUL = 6.0
-"""Score of a description above which it is doubted although no alternative explains it."""
-
+# Score that clocks and frame rates must gain to be scored exactly: half of what their margin asks.
+_LEAST_GAIN_OF_TIMES = 1.0
+# By how much an alternative must lower the objective, beyond its price, to be named.
+_MARGIN = 3.0
+# Chi^2 that counts as much as one of the score.
+_COST_OF_SCORE = 4.7
+# Score of a description from which more than times is tried.
+_ODD = 3.0
+# Scatter of rays from which more than times is tried, whatever the score; 0.35 to 0.7 on right flights.
+_SCATTERED = 0.65
+# Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights.
+_MISSED = 1.8
+# Chi^2 of constant errors of poses from which numbers of one camera are tried.
+_STRAINED = 10.0
+# Standard deviations from which a single unusual measure is a doubt at any score.
+_STRANGE = 5.0
+# The same of the stature: mistakes of scale are less rare than people below 1.27 m or above 2.12 m.
+_STRANGE_SIZE = 2.5
+# Score of a description above which it is doubted although no alternative explains it.
+_DOUBTFUL = 6.0
 # Logs nearer to each other than this do not tell own origins from positions in a smaller unit.
 _HOVERING_M = 0.5
 # Drones that all fly lower than this below zero count heights downwards.
@@ -121,8 +104,6 @@ _WITHOUT_CAUSE = 9.0
 _MEETING, _LEFT_MISFIT = 0.9, 2.5
 # Sums of chi^2 in other pictures, of which a clock's search tries many, differ by so many deviations.
 _MOST_BY_CHANCE = 2.0
-# In this time people and cameras move by more than keypoints err; so far is a clock followed.
-_RAYS_STEP_S, _MOST_STEPS = 0.05, 20
 
 
 def doubts_of(
@@ -236,28 +217,27 @@ def diagnose(
     trial = Trial(flight, scene_of(flight))
     found = score(flight, trial.described)
     # A turned world leaves rays and bodies as they are; rolled cameras mirror the body.
-    mirrored = any(found.odd[name].sigmas >= STRANGE for name in ("face", "bend") if name in found.odd)
-    fits = found.misfit < MISSED and found.scatter < _MEETING and not mirrored
+    mirrored = any(found.odd[name].sigmas >= _STRANGE for name in ("face", "bend") if name in found.odd)
+    fits = found.misfit < _MISSED and found.scatter < _MEETING and not mirrored
     objective = Objective(trial, found)
     tried: list[Tried | None] = [*_of_logs(objective), *_of_turns(objective, late)]
     strange = _is_strange(found)
-    odd = strange or found.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
+    odd = strange or found.total >= _ODD or found.scatter >= _SCATTERED or found.misfit >= _MISSED
     if odd:
         tried += map(objective.scored, alternatives.discrete(trial))
         tried += map(objective.with_numbers, alternatives.numbers_of_all(trial))
-    is_strained = odd or objective.described.strain >= STRAINED
+    is_strained = odd or objective.described.strain >= _STRAINED
     if is_strained:
         tried += map(objective.with_numbers, alternatives.numbers_of_one(trial))
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
     if "size" in found.odd and is_strained:
-        dearer = 0.0 if found.odd["size"].sigmas >= STRANGE_SIZE else MARGIN
+        dearer = 0.0 if found.odd["size"].sigmas >= _STRANGE_SIZE else _MARGIN
         scales = alternatives.scales(trial, solve(trial.described).joints, found.stature_m, dearer)
         tried += map(objective.scored, scales)
     # Times come last, since most of them need no exact score beside what fits by then.
     tried += map(objective.scored, alternatives.rates(trial))
-    for index in trial.every:
-        tried += [objective.best_clock([index]), objective.clock_of_rays(index)]
-    tried += [objective.best_clock(trial.every)] if odd and trial.moving else []
+    groups = [*([index] for index in trial.every), *([trial.every] if odd and trial.moving else [])]
+    tried += map(objective.best_clock, groups)
     causes, gained = _causes(objective, [each for each in tried if each is not None], odd)
     if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
         level = alternatives.level(trial, solve(trial.described).joints) if fits else ()
@@ -266,7 +246,7 @@ def diagnose(
         causes = _of_looks(trial, looks or {}) or causes
     codes = [cause.alternative.code for cause in causes if cause.score]
     doubts = [_doubt(trial, each, found, codes) for each in causes]
-    if doubts or strange or found.total >= DOUBTFUL or gained >= _WITHOUT_CAUSE:
+    if doubts or strange or found.total >= _DOUBTFUL or gained >= _WITHOUT_CAUSE:
         named = {doubt.code for doubt in doubts}
         named |= {"scale"} if "unit" in named else set()
         named |= {"clock"} if "frame_rate" in named else set()
@@ -277,8 +257,8 @@ def diagnose(
 
 def _is_strange(described: Score) -> bool:
     """Test if a single unusual measure is a doubt at any total."""
-    limits = {"size": STRANGE_SIZE, "unposed": np.inf}  # a log may end early
-    return any(each.sigmas >= limits.get(name, STRANGE) for name, each in described.odd.items())
+    limits = {"size": _STRANGE_SIZE, "unposed": np.inf}  # a log may end early
+    return any(each.sigmas >= limits.get(name, _STRANGE) for name, each in described.odd.items())
 
 
 # --- one number by which all alternatives are compared ----------------------------------------------------
@@ -313,12 +293,12 @@ class Tried(NamedTuple):
         """
         by_score, by_rays = np.subtract(self.before, self.after)
         if self.alternative.code in TIMES:
-            is_scored = by_score >= LEAST_GAIN_OF_TIMES
-            least = -_ALIKE if is_scored and self.alternative.same_pictures is None else MARGIN
+            is_scored = by_score >= _LEAST_GAIN_OF_TIMES
+            least = -_ALIKE if is_scored and self.alternative.same_pictures is None else _MARGIN
         else:
-            least = -np.inf if odd else MARGIN
+            least = -np.inf if odd else _MARGIN
         # Whoever is far too tall or small is doubted anyway.
-        margin = 0.0 if self.alternative.code == "scale" else MARGIN
+        margin = 0.0 if self.alternative.code == "scale" else _MARGIN
         return self.gain >= margin and bool(by_rays >= least)
 
 
@@ -341,7 +321,7 @@ class Objective:
         """Score an alternative."""
         if alternative.scene is None:
             return Tried(alternative)
-        least = LEAST_GAIN_OF_TIMES if alternative.code in TIMES else -_SPARE
+        least = _LEAST_GAIN_OF_TIMES if alternative.code in TIMES else -_SPARE
         limit = min(self.best_total + _SPARE, self.base.total - least)
         same = alternative.same_scatter
         flight = alternative.flight or self.trial.flight
@@ -364,33 +344,6 @@ class Objective:
             beside = [(best, late_s), at(late_s - step_s), at(late_s + step_s)]
             best, late_s = min(beside, key=lambda each: each[0].total)
         return best if abs(late_s) >= _LEAST_CLOCK_S else None
-
-    def clock_of_rays(self, index: int) -> Tried | None:
-        """Follow the chi^2 of the rays downwards from one camera's stated clock; None if that stays.
-
-        Constant errors of all poses are fitted beside it; the score takes them for other clocks. Steps are
-        long, since keypoints err anew in every picture: short ones show that noise alone.
-        """
-        known: dict[int, float] = {}
-
-        def saved(step: int) -> float:
-            if step not in known:
-                scene = self.trial.with_times([index], step * _RAYS_STEP_S)
-                known[step] = self._fit(self._at_moments_of(scene)).cost - self._fit(scene).cost
-            return known[step]
-
-        best = towards = max((0, -1, 1), key=saved)
-        while towards and abs(best) < _MOST_STEPS and saved(best + towards) > saved(best):
-            best += towards
-        bend = 2 * saved(best) - saved(best - 1) - saved(best + 1)
-        least = LEAST_SIGMAS**2 + _MOST_BY_CHANCE * self._chance(self.described.cost, [index])
-        if not best or saved(best) < least or not 0 < bend < np.inf:
-            return None
-        late_s = (best + (saved(best + 1) - saved(best - 1)) / (2 * bend)) * _RAYS_STEP_S
-        scene = self.trial.with_times([index], late_s)
-        surer = float(np.log1p(late_s**2 * bend / 2 / _RAYS_STEP_S**2))
-        cost = self._fit(scene).cost + surer + _OF_ANY_SIZE
-        return self.scored(alternatives.clock(self.trial, [index], late_s), cost)._replace(numbers=1)
 
     def _at_moments_of(self, scene: SceneOfMoments) -> SceneOfMoments:
         """Return the description at the moments that a scene shows."""
@@ -422,23 +375,19 @@ class Objective:
         return tried._replace(numbers=len(size))
 
     def with_noise(self, tried: Sequence[Alternative]) -> Tried:
-        """Take the factor of larger errors that fits best."""
-        return min(
-            (self.scored(each, self._cost_of_noise(each)) for each in tried), key=lambda each: each.cost
-        )
-
-    def _cost_of_noise(self, alternative: Alternative) -> float:
-        """Return the chi^2 of larger errors: 6 of each camera and 2 of each picture are less likely."""
-        wider, described = alternative.scene, self.trial.described
-        if wider is None:
-            return np.inf
-        constant = 12 * float(np.log(wider.sigma[:, 0] / described.sigma[:, 0]).sum())
-        changing = 2 * float(self._pictures @ np.log(picture_variance(wider) / picture_variance(described)))
-        return self._fit(wider).cost + constant + changing
+        """Take the factor of larger errors that fits best; 6 of a camera and 2 of a picture pay for it."""
+        described, known = self.trial.described, []
+        for each in tried:
+            wider = each.scene or described
+            constant = 12 * float(np.log(wider.sigma[:, 0] / described.sigma[:, 0]).sum())
+            changing = np.log(picture_variance(wider) / picture_variance(described))
+            cost = self._fit(wider).cost + constant + 2 * float(self._pictures @ changing)
+            known.append(self.scored(each, cost))
+        return min(known, key=lambda each: each.cost)
 
     def _rays(self, cost: float, scene: SceneOfMoments) -> float:
         pictures = float(self._pictures.sum())
-        return 2 * pictures * float(np.log1p(cost / pictures)) / COST_OF_SCORE + surprise(unposed(scene))
+        return 2 * pictures * float(np.log1p(cost / pictures)) / _COST_OF_SCORE + surprise(unposed(scene))
 
     def _cost_of_pictures(self, scene: SceneOfMoments) -> float:
         """Return the chi^2 of the description in the pictures that a scene shows, for as many as it has."""
@@ -451,10 +400,6 @@ class Objective:
             return np.inf
         rays = np.where(kept[..., None, None], described.rays, np.nan)
         return self._fit(replace(described, rays=rays)).cost * float(seen.sum() / kept.sum())
-
-    def _chance(self, cost: float, cameras: list[int]) -> float:
-        """Return the deviation of the chi^2 where moments are of other pictures, with other errors."""
-        return cost * float(np.sqrt(2 * self._pictures[cameras].sum()) / self._pictures.sum())
 
     def compared(self, tried: Tried) -> Tried:
         """Compare an alternative and its price with the description.
@@ -481,7 +426,8 @@ class Objective:
             others = [self.trial.names.index(name) for name in tried.alternative.cameras]
             # Few rates of one camera are tried, and its rays must go on meeting those of the others.
             one_rate = tried.alternative.code == "frame_rate" and tried.alternative.same_pictures is None
-            chance = (1.0 if one_rate else _MOST_BY_CHANCE) * self._chance(before, others)
+            deviation = before * float(np.sqrt(2 * self._pictures[others].sum()) / self._pictures.sum())
+            chance = (1.0 if one_rate else _MOST_BY_CHANCE) * deviation
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
         rays = (self._rays(before, described), self._rays(cost, scene))
@@ -527,7 +473,7 @@ def _of_either(trial: Trial, cause: Tried, known: Sequence[Tried]) -> Alternativ
         _leaves_no_doubt(trial.flight, each.alternative)
         for each in known
         if (each.alternative.code, each.alternative.cameras) == (own.code, other)
-        and cause.gain - each.gain < MARGIN
+        and cause.gain - each.gain < _MARGIN
     )
     if not beside and not any(alike):
         return own
@@ -546,7 +492,7 @@ def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
     found = score(alternative.flight or flight, alternative.scene)
     meets = found.misfit < _LEFT_MISFIT and found.scatter < _MEETING
     # Larger errors of poses are no cause that mends the rays.
-    return found.total < DOUBTFUL and (meets or alternative.price == np.inf) and not _is_strange(found)
+    return found.total < _DOUBTFUL and (meets or alternative.price == np.inf) and not _is_strange(found)
 
 
 def _below_zero(objective: Objective) -> list[Tried]:
@@ -583,7 +529,7 @@ def _of_turns(objective: Objective, tried: Sequence[Lateness]) -> list[Tried]:
             return late.gain
         scene = trial.with_times(late.cameras, late.late_s, late.slower)
         found = objective.compared(objective.scored(Alternative("clock", (), "", "", np.inf, scene)))
-        return late.gain + COST_OF_SCORE * found.gain
+        return late.gain + _COST_OF_SCORE * found.gain
 
     late = max(tried, key=gain)
     if late.gain < LEAST_GAIN or (late.slower == 1 and not is_sure_clock(late)):
@@ -603,7 +549,7 @@ def _is_explained(causes: Sequence[Tried]) -> bool:
     if not causes:
         return False
     first = causes[0]
-    fits = first.score is not None and first.score.misfit < MISSED
+    fits = first.score is not None and first.score.misfit < _MISSED
     return first.numbers == 0 or (first.alternative.code in ("mount", "intrinsics") and fits)
 
 
@@ -658,13 +604,9 @@ def _doubt(trial: Trial, cause: Tried, described: Score, codes: Sequence[str]) -
     if np.isfinite(cause.gain):
         before, after = (round(sum(parts), 2) for parts in (cause.before, cause.after))
         told["tried"] = {"misfit_before": before, "misfit_after": after, "doubts_after": 0}
-    return Doubt(
-        code=alternative.code,
-        cameras=list(alternative.cameras),
-        what=alternative.what + (f" (not sure: {others} explains the flight as well)" if others else ""),
-        evidence=told,
-        remedy="" if others else alternative.remedy,
-    )
+    what = alternative.what + (f" (not sure: {others} explains the flight as well)" if others else "")
+    remedy, named = "" if others else alternative.remedy, list(alternative.cameras)
+    return Doubt(code=alternative.code, cameras=named, what=what, evidence=told, remedy=remedy)
 
 
 # What is odd about a person, by the name it has in a score: the code of its doubt, and the sentence.
@@ -673,15 +615,12 @@ _UNUSUAL = {
     "shape": ("body", "the lengths of the limbs are not in the proportions of people"),
     "limp": ("body", "the lengths of the limbs change over time, by {limb_spread:.0%}"),
     "upright": ("body", "the person does not stand upright, but leans by {lean_deg:.0f} deg"),
-    "wander": ("body", "the person leans to and fro"),
     "face": ("body", "the face looks backwards, or left is right"),
     "crossed": ("body", "limbs cross: left and right are exchanged in the names of some joints, not of all"),
     "bend": ("body", "knees or elbows bend the wrong way"),
     "course": ("body", "the person walks sideways or backwards"),
-    "slide": ("body", "the foot that stands slides, with {foot_mps:.1f} m/s"),
     "tread": ("body", "legs go at {legs_over_pace:.1f} times the pace: the standing foot slides"),
     "speed": ("body", "the person is faster than people run: {pace_mps:.1f} m/s"),
-    "climb": ("body", "the person rises and falls faster than people do: {climb_mps:.1f} m/s"),
     "above": ("ground", "the person is {above_m:.1f} m above the drones"),
     "ground": ("ground", "the feet are {feet_above_ground_m:+.1f} m from the ground of the map"),
     "beside": ("ground", "the person is beside the map"),
@@ -694,7 +633,6 @@ _UNUSUAL = {
     "actor_path": ("actor", "the person takes another way than the logged actor, {path_apart_m:.1f} m apart"),
     "unused": ("residual", "{unused_share:.0%} of the joints cannot be used: their rays miss each other"),
     "behind": ("residual", "joints are behind the cameras that see them"),
-    "parallax": ("residual", "the cameras look from the same side: the rays hardly cross"),
 }
 # What is less odd than this many standard deviations is not worth a sentence.
 _LEAST_UNUSUAL = 2.0
@@ -711,22 +649,14 @@ def _unusual_measures(trial: Trial, described: Score, *, alone: bool) -> list[Do
         if sigmas >= _LEAST_UNUSUAL and name in _UNUSUAL:
             code, words = _UNUSUAL[name]
             what = words.format(usual=STATURE_M, **measured)
-            evidence = {key: round(value, 3) for key, value in (*measured.items(), ("sigmas", sigmas))}
-            found.setdefault(code, Doubt(code=code, cameras=names, what=what, evidence=evidence, remedy=""))
+            known = {key: round(value, 3) for key, value in (*measured.items(), ("sigmas", sigmas))}
+            found.setdefault(code, Doubt(code=code, cameras=names, what=what, evidence=known, remedy=""))
     if described.misfit > _LEAST_UNUSUAL or (alone and not found):
-        residual_px, *each_px = residuals_px(trial.described)
-        evidence = {
-            "misfit": round(described.misfit, 2),
-            "residual_px": residual_px,
-            "scatter": round(described.scatter, 2),
-        }
-        evidence |= {f"residual_px_{name}": value for name, value in zip(names, each_px, strict=True)}
-        times = f"{described.misfit:.1f} times"
-        found["residual"] = Doubt(
-            code="residual",
-            cameras=names,
-            what=f"the rays miss each other by {times} what keypoints and poses are stated to err by",
-            evidence={name: value for name, value in evidence.items() if np.isfinite(value)},
-            remedy="",
-        )
+        evidence = {"misfit": round(described.misfit, 2), "scatter": round(described.scatter, 2)}
+        keys = ["residual_px", *(f"residual_px_{name}" for name in names)]
+        evidence |= zip(keys, residuals_px(trial.described), strict=True)
+        evidence = {name: value for name, value in evidence.items() if np.isfinite(value)}
+        what = f"the rays miss each other by {described.misfit:.1f} times what keypoints and poses"
+        what += " are stated to err by"
+        found["residual"] = Doubt(code="residual", cameras=names, what=what, evidence=evidence, remedy="")
     return list(found.values())

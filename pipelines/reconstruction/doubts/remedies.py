@@ -31,11 +31,6 @@ def lines(cameras: Iterable[Filmed], line_of: Callable[..., str], *values: Any, 
     return "; ".join(f"cameras.{camera.name}.{line_of(camera, *values, **named)}" for camera in cameras)
 
 
-def as_said(_: Filmed, line: str) -> str:
-    """Write the same line for each camera."""
-    return line
-
-
 def clock(camera: Filmed, seconds: float) -> str:
     """Move the clock of a camera's pictures."""
     return offset_of(camera.entry, seconds)

@@ -447,14 +447,12 @@ class Body:
 
     def posture(self) -> dict[str, Oddity]:
         """Measure how upright the person is, where the face is, and on which sides and how the limbs are."""
-        cosine = self.cosine
-        middle = median(cosine)
+        middle = median(self.cosine)
         lean = {"lean_deg": float(np.degrees(np.arccos(middle)))}
         leaning, head_down = min((1 - middle) / 0.15, _LYING), max(0.0, _HEAD_DOWN - middle) / 0.05
         same_sides, bent = self._same_sides(), self._bent_as_people()
         odd = {
             "upright": Oddity(leaning + head_down, lean),
-            "wander": Oddity(min(median(np.abs(cosine - middle)) / 0.1, _LYING), lean),
             "crossed": Oddity(max(0.0, 0.5 - same_sides) / 0.03, {"uncrossed_share": same_sides}),
             "bend": Oddity(max(0.0, 0.4 - bent) / 0.06, {"bent_forwards_share": bent}),
         }
@@ -499,7 +497,7 @@ class Body:
         return min((float((each > 0).mean()) for each in along if each.size > _FEWEST_MOMENTS), default=1.0)
 
     def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, Oddity]:
-        """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides.
+        """Measure how oddly the person moves: not forwards, faster than people, or on feet that slide.
 
         Args:
             flight: the flight.
@@ -509,21 +507,13 @@ class Body:
         """
         step_s = STEP_NS / 1e9
         noise = np.sqrt(2) * white_m / step_s  # m/s
-        moved = (self.hips[flight.second] - self.hips[flight.first]) / step_s
-        pace = np.linalg.norm(moved[:, :2], axis=-1)
-        feet = [
-            np.linalg.norm(self[name][flight.second] - self[name][flight.first], axis=-1) / step_s
-            for name in ("left_ankle", "right_ankle")
-        ]
+        moved = (self.hips[flight.second] - self.hips[flight.first])[:, :2]
+        pace = np.linalg.norm(moved, axis=-1) / step_s
         of_foot = float(np.hypot(noise, np.sqrt(2) * keypoint_m / step_s))
-        climbed, slid = median(np.abs(moved[:, 2])), median(np.minimum(*feet))
         fast, ahead = quantile(pace, 0.75), self._ahead(flight, white_m)
-        slides = max(0.0, slid - 0.4 * stature / 1.7 - of_foot) / (0.5 + of_foot / 2)
         return {
             "course": Oddity(max(0.0, 0.5 - ahead) / 0.15, {"course_cosine": ahead}),
             "speed": Oddity(max(0.0, fast - 4.0 - 1.5 * noise) / (2 + noise), {"pace_mps": fast}),
-            "climb": Oddity(max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2), {"climb_mps": climbed}),
-            "slide": Oddity(slides, {"foot_mps": slid}),
             "tread": self._tread(flight, stature, of_foot),
         }
 

@@ -167,7 +167,6 @@ class Fit:
     numbers: Float  # [n]
     cost: float  # chi^2
     strain: float  # the part of it that is of constant errors, the logged actor and the person's stature
-    errors: Float  # [C, 6] of all poses, m and rad
     scene: SceneOfMoments  # of the numbers; the constant errors stay in it
     covariance: Float  # [n, n] of the numbers: what the constant errors leave of it; without, of all errors
 
@@ -184,13 +183,13 @@ def fit(flight: Sampled, make: Make, start: Float | None = None, loose: Sequence
     numbers = np.zeros(0) if start is None else start
     scene = make(numbers)
     errors = np.zeros((len(scene.focal_px), 6))
-    best, last = Fit(numbers, np.inf, np.inf, errors, scene, np.zeros((0, 0))), np.inf
+    best, last = Fit(numbers, np.inf, np.inf, scene, np.zeros((0, 0))), np.inf
     for _ in range(_STEPS):
         cost, strain, change, covariance = _step(flight, make, numbers, errors, loose)
         settled = abs(cost - last) < _CONVERGED
         last = cost
         if cost < best.cost:
-            best = Fit(numbers, cost, strain, errors, make(numbers), covariance)
+            best = Fit(numbers, cost, strain, make(numbers), covariance)
         if settled or not np.isfinite(cost) or cost > 4 * best.cost + 100:
             break
         errors = errors + change[: errors.size].reshape(errors.shape)
@@ -385,9 +384,8 @@ def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]
 
 # --- score ------
 
-IMPOSSIBLE = 99.0
-"""Score of a scene in which next to nothing is seen by two cameras."""
-
+# Score of a scene in which next to nothing is seen by two cameras.
+_IMPOSSIBLE = 99.0
 _CHI2_MEDIAN = {
     1: 0.455,
     3: 0.789,
@@ -449,7 +447,7 @@ def score(
     solved = solve(scene)
     good = solved.views >= 2
     if good.sum() < _FEWEST or (base is not None and good.mean() < 0.4 * base.covered):
-        return Score(IMPOSSIBLE, np.inf, np.inf, {}, np.nan)
+        return Score(_IMPOSSIBLE, np.inf, np.inf, {}, np.nan)
     misfit = _misfit(solved, good)
     # Two cameras have one draw of constant errors between them: chi^2 of few.
     soft = 2.0 if len(scene.focal_px) == 2 else 1.5
@@ -472,15 +470,17 @@ def score(
         if total > limit:
             return Score(total, misfit, scatter, {"behind": behind}, np.nan)
     body = Body(solved.joints)
-    statures = body.statures
-    stature = median(statures)
-    if np.isfinite(statures).sum() < 5 or not stature > 0:
-        return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
+    stature = median(body.statures)
+    if np.isfinite(body.statures).sum() < 5 or not stature > 0:
+        return Score(_IMPOSSIBLE, misfit, np.inf, {}, np.nan)
     pairs = combinations(scene.position, 2)
     apart_m = np.max([np.linalg.norm(one - other, axis=-1) for one, other in pairs], axis=0)
     loose = float(np.sqrt(2) * scene.sigma[:, 0].mean() / max(median(apart_m), 1e-9))  # share of the scale
-    odd = _rays(solved, good, misfit) | body.proportions(stature, loose) | body.posture()
+    odd = body.proportions(stature, loose) | body.posture()
     odd |= _place(flight, scene, body, solved, stature)
+    freedom, gate = 2 * solved.views[good] - 3, (_UNUSED_SIGMAS * max(misfit, 1.0)) ** 2
+    unused = float((solved.chi2[good] > gate * freedom).mean())
+    odd["unused"] = Oddity(max(0.0, unused - _USUALLY_UNUSED) / 0.05, {"unused_share": unused})
     odd = {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
     total += sum(surprise(each) for each in odd.values())
     odd |= {"behind": behind, "unposed": unposed(scene)}
@@ -510,24 +510,6 @@ def _misfit(solved: SolvedJoints, good: Bool) -> float:
         among = good & (freedom == value)
         total += among.sum() * median(solved.chi2[among]) / value / _CHI2_MEDIAN.get(int(value), 0.9)
     return float(np.sqrt(total / good.sum()))
-
-
-def _rays(solved: SolvedJoints, good: Bool, misfit: float) -> dict[str, Oddity]:
-    """Measure joints that gates reject, and the best pair's angle."""
-    freedom = 2 * solved.views[good] - 3
-    gate = (_UNUSED_SIGMAS * max(misfit, 1.0)) ** 2
-    unused = float((solved.chi2[good] > gate * freedom).mean())
-    sine = 0.0
-    for one, other in combinations(range(len(solved.seen)), 2):
-        both = solved.seen[one] & solved.seen[other]
-        if both.any():
-            cosine = (solved.direction[one][both] * solved.direction[other][both]).sum(axis=-1)
-            sine = max(sine, median(np.sqrt(np.maximum(0.0, 1.0 - cosine**2))))
-    parallel, parallax_deg = max(0.0, 0.1 / max(sine, 1e-4) - 1), float(np.degrees(np.arcsin(sine)))
-    return {
-        "parallax": Oddity(parallel, {"parallax_deg": parallax_deg}),
-        "unused": Oddity(max(0.0, unused - _USUALLY_UNUSED) / 0.05, {"unused_share": unused}),
-    }
 
 
 def _scatter(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
