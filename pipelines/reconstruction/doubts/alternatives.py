@@ -22,6 +22,7 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
 )
+from pipelines.geometry.rig import between
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import (
     FEW,
@@ -37,6 +38,8 @@ from pipelines.reconstruction.doubts.scene import (
     trunk_direction,
 )
 from pipelines.reconstruction.observations import Filmed
+from pipelines.reconstruction.solving import NOSE_TO_ANKLES
+from pipelines.session.people import mirrored
 
 RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 """Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
@@ -44,9 +47,8 @@ RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
 PRICE_OF_ALL = 0.5
 """Price of an alternative of all cameras alike."""
 
-PRICE_OF_ONE = 0.8
-"""Price of an alternative of one camera, of which there are as many as cameras."""
-
+# Price of an alternative of one camera, of which there are as many as cameras.
+_PRICE_OF_ONE = 0.8
 _FLU_FROM_OPTICAL, _FLU_FROM_FRD, _ENU_FROM_NED = (
     matrix_from_quaternion(each).round() for each in (body_from_camera("forward"), FLU_FROM_FRD, ENU_FROM_NED)
 )
@@ -67,11 +69,7 @@ _LEAST_OWN_SIGMAS = 3.0
 _LEAST_SHIFT_M, _LEAST_TURN_RAD, _LEAST_ZOOM = 0.2, np.radians(2.0), 0.1
 # Focal lengths are wrong by at most this logarithm: a factor of twenty.
 _MOST_ZOOM = 3.0
-# The nose is this share of the stature above the ankles (Winter 2009).
-_NOSE_TO_ANKLES = 0.9
-_LEFT_RIGHT = [
-    JOINTS.index(name.replace("left", "@").replace("right", "left").replace("@", "right")) for name in JOINTS
-]
+_LEFT_RIGHT = [JOINTS.index(mirrored(name)) for name in JOINTS]
 
 
 @dataclass(frozen=True)
@@ -89,6 +87,10 @@ class Alternative:
     # Of times of all cameras: the scene of the same pictures, at the moments of the flight beside it.
     same_pictures: Callable[[], tuple[SceneOfMoments, Sampled]] | None = None
     flight: Sampled | None = None  # where a map and an actor are other than described
+
+
+Group = tuple[Sequence[int] | None, float]
+"""Cameras of an alternative, None for all that move, and its price."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class Trial:
         """Take all cameras together, then each, which is dearer."""
         if len(members) > 1:
             yield list(members), PRICE_OF_ALL
-        yield from (([index], PRICE_OF_ONE) for index in members)
+        yield from (([index], _PRICE_OF_ONE) for index in members)
 
     def lines(self, group: Sequence[int], line_of: Callable[..., str], *values: Any, **named: Any) -> str:
         """Write the lines of a remedy for the cameras of a group."""
@@ -151,47 +153,37 @@ class Trial:
                 on_gimbal[index] = self.cameras[index].entry.poses.gimbal
         return body, on_gimbal
 
-    def with_times(self, group: Sequence[int], late_s: float = 0.0, slower: float = 1.0) -> SceneOfMoments:
+    def with_times(self, group: Sequence[int], late_s: float, slower: float) -> SceneOfMoments:
         """Add seconds to the times of cameras' pictures, and let them follow each other more slowly."""
-        late, factor = np.zeros(len(self.names)), np.ones(len(self.names))
-        late[list(group)], factor[list(group)] = late_s, slower
-        return scene_of(self.flight, self.described, late_s=late, slower=factor)
+        return scene_of(self.flight, self.described, times=dict.fromkeys(group, (late_s, slower)))
 
-    def with_all_times(self, late_s: float = 0.0, slower: float = 1.0) -> tuple[SceneOfMoments, Sampled]:
+    def with_all_times(self, late_s: float, slower: float) -> tuple[SceneOfMoments, Sampled]:
         """Change all times and look at the same pictures, at the moments at which they were taken then."""
         moved = self.flight.at_other_times(late_s, slower)
-        late, factor = np.full(len(self.names), late_s), np.full(len(self.names), slower)
-        return scene_of(moved, late_s=late, slower=factor), moved
+        return scene_of(moved, times=dict.fromkeys(self.every, (late_s, slower))), moved
 
     def posed(
-        self,
-        code: str,
-        what: str,
-        remedy: str,
-        rotation: Float,
-        position: Float | None = None,
-        *,
-        group: Sequence[int] | None = None,
-        price: float = PRICE_OF_ALL,
-        same_scatter: bool = False,
+        self, code: str, what: str, remedy: str, of: Group, rotation: Float, position: Float | None = None
     ) -> Alternative:
-        """Take attitudes [C, T, 3, 3] and places [C, T, 3] of a group, by default of all moving cameras."""
+        """Take the attitudes [C, T, 3, 3] and places [C, T, 3] of some cameras from other ones."""
+        group, price = of
         own, names = (self.moving, self.names) if group is None else (list(group), self.named(group))
         turned, moved = self.described.rotation.copy(), self.described.position.copy()
         turned[own], moved[own] = rotation[own], (moved if position is None else position)[own]
         scene = replace(self.described, rotation=turned, position=moved)
+        same_scatter = code == "unit" and group is None  # larger errors of larger positions
         return Alternative(code, names, what, remedy, price, scene, same_scatter)
 
     def with_pixels(
-        self, group: Sequence[int], factor: float = 1.0, mirrored: Set[str] = frozenset()
+        self, group: Sequence[int], factor: float = 1.0, flipped: Set[str] = frozenset()
     ) -> SceneOfMoments:
         """Enlarge the pixels of cameras; mirror their `x` or `y`, or the `names` of left and right joints."""
-        pixels, both = [camera.pixels for camera in self.cameras], ["x" in mirrored, "y" in mirrored]
+        pixels, both = [camera.pixels for camera in self.cameras], ["x" in flipped, "y" in flipped]
         for index in group:
             own = self.cameras[index].intrinsics
             last = np.array([own.width, own.height]) - 1
             other = np.where(both, last - pixels[index], factor * pixels[index])
-            pixels[index] = other[:, _LEFT_RIGHT] if "names" in mirrored else other
+            pixels[index] = other[:, _LEFT_RIGHT] if "names" in flipped else other
         return scene_of(self.flight, self.described, pixels=pixels)
 
 
@@ -214,7 +206,7 @@ def rates(trial: Trial) -> Iterator[Alternative]:
             unfilmed = [_unfilmed(trial.cameras[k], factor) - _unfilmed(trial.cameras[k]) for k in group]
             dearer = max(0.0, _PRICE_OF_UNFILMED * float(np.mean(unfilmed)))
             dearer += _PRICE_OF_UNUSUAL_RATE * (not _is_usual(stated_hz / factor))
-            yield rate(trial, group, factor, price + dearer)
+            yield of_times(trial, group, slower=factor, price=price + dearer)
 
 
 def _is_usual(rate_hz: float) -> bool:
@@ -228,25 +220,19 @@ def _unfilmed(camera: Filmed, slower: float = 1.0) -> float:
     return float(max(0, end - first - (last - first) * slower) / max(end - begin, 1))
 
 
-def rate(trial: Trial, group: list[int], factor: float, price: float = 0.0) -> Alternative:
-    """Change the frame rate of one camera, or of all."""
-    what = f"the frame rate of {trial.whose(group)} is {1 / factor:.3g} times what is stated"
-    remedy = trial.lines(group, remedies.frame_rate, factor)
-    return _of_times(trial, "frame_rate", group, what, remedy, price, slower=factor)
-
-
-def clock(trial: Trial, group: list[int], late_s: float) -> Alternative:
-    """Move the clock of one camera, or of all."""
-    what = f"the pictures of {trial.whose(group)} were taken {remedies.earlier_or_later(late_s)}"
-    remedy = trial.lines(group, remedies.clock, late_s)
-    return _of_times(trial, "clock", group, what, remedy, 1.0 + abs(late_s) / 2, late_s=late_s)
-
-
-def _of_times(
-    trial: Trial, code: str, group: list[int], what: str, remedy: str, price: float, **changes: float
+def of_times(
+    trial: Trial, group: list[int], late_s: float = 0.0, slower: float = 1.0, price: float = 0.0
 ) -> Alternative:
-    same = partial(trial.with_all_times, **changes) if len(group) == len(trial.names) else None
-    scene = trial.with_times(group, **changes)
+    """Move the clock of one camera, or of all, or change the frame rate at a price."""
+    if slower == 1:
+        code, price = "clock", 1.0 + abs(late_s) / 2
+        what = f"the pictures of {trial.whose(group)} were taken {remedies.earlier_or_later(late_s)}"
+        remedy = trial.lines(group, remedies.clock, late_s)
+    else:
+        code, remedy = "frame_rate", trial.lines(group, remedies.frame_rate, slower)
+        what = f"the frame rate of {trial.whose(group)} is {1 / slower:.3g} times what is stated"
+    same = partial(trial.with_all_times, late_s, slower) if len(group) == len(trial.names) else None
+    scene = trial.with_times(group, late_s, slower)
     return Alternative(code, trial.named(group), what, remedy, price, scene, same_pictures=same)
 
 
@@ -304,8 +290,7 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
         return
     remedy = f"world.up: {'-' if up[largest] < 0 else ''}{'xyz'[largest]}"
     if beside_deg > AXIS_WITHIN_DEG:
-        quaternion = np.append(np.cross(up, z), 1.0 + up[2])  # the shortest rotation upwards
-        turn = matrix_from_quaternion(quaternion / np.linalg.norm(quaternion))
+        turn = matrix_from_quaternion(between(up, z))
         remedy = trial.lines(trial.every, remedies.placed, np.zeros(3), turn)
     what = f"the world's z does not point up: people and pictures are upright {tilt_deg:.0f} deg from it"
     evidence = {"tilt_deg": tilt_deg, "beside_axis_deg": beside_deg, "gain": gain}
@@ -375,10 +360,11 @@ def discrete(trial: Trial) -> Iterator[Alternative]:
         for index in trial.moving:
             poses = trial.cameras[index].entry.poses
             written.setdefault((Path(poses.source).suffix.lower(), poses.topic is None), []).append(index)
-        kinds: list[list[int] | None] = [None, *(written.values() if len(written) > 1 else ())]
+        kinds = [*(written.values() if len(written) > 1 else ())]
         kinds += [[index] for index in trial.moving if len(trial.moving) > 1 and [index] not in kinds]
-        yield from chain(_mounts(trial), _gimbals(trial), *(_conventions(trial, kind) for kind in kinds))
-        yield from chain(*(_units(trial, kind) for kind in kinds))
+        groups: list[Group] = [(None, PRICE_OF_ALL), *((kind, _PRICE_OF_ONE) for kind in kinds)]
+        yield from chain(_mounts(trial), _gimbals(trial), *(_conventions(trial, of) for of in groups))
+        yield from chain(*(_units(trial, of) for of in groups))
     yield from _keypoints(trial)
     price = PRICE_OF_ALL + np.log(len(_FOCAL_FACTORS)) / 2
     for factor in _FOCAL_FACTORS:
@@ -390,7 +376,7 @@ def discrete(trial: Trial) -> Iterator[Alternative]:
 
 def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
     names, cameras = trial.names, trial.cameras
-    price = PRICE_OF_ALL if len(names) == 2 else PRICE_OF_ONE  # of more cameras there are more ways
+    price = PRICE_OF_ALL if len(names) == 2 else _PRICE_OF_ONE  # of more cameras there are more ways
     for order in permutations(trial.every) if 2 <= len(names) <= 5 else ():
         moved = [index for index in trial.every if order[index] != index]
         if moved:
@@ -406,22 +392,23 @@ def _exchanged_pictures(trial: Trial) -> Iterator[Alternative]:
 def _mounts(trial: Trial) -> Iterator[Alternative]:
     """Try cameras that are rolled, or look another way, by right angles, and the other sign of tilts."""
     rotation, mounts = trial.described.rotation, trial.mounts
-    for (group, price), degrees in product(trial.groups(trial.moving), (90, 180, 270)):
+    for of, degrees in product(trial.groups(trial.moving), (90, 180, 270)):
+        group, _ = of
         turn, whose, signed = turn_about("z", degrees), trial.whose(group), (degrees + 179) % 360 - 179
         rolled = f"{whose} is rolled by {signed} deg about the optical axis"
         remedy = trial.lines(group, remedies.mount, after=turn)
-        yield trial.posed("mount", rolled, remedy, rotation @ turn, group=group, price=price)
+        yield trial.posed("mount", rolled, remedy, of, rotation @ turn)
         side, aside = "left" if signed > 0 else "right", rotation @ mounts.mT @ turn @ mounts
         what = f"{whose} is mounted {abs(signed)} deg to the {side} of where it is said to look"
         remedy = trial.lines(group, remedies.mount, before=turn)
-        yield trial.posed("mount", what, remedy, aside, group=group, price=price)
+        yield trial.posed("mount", what, remedy, of, aside)
     down = {index: remedies.down_deg(trial.cameras[index]) for index in trial.moving}
     tilted = {index: turn_about("x", 2 * degrees) for index, degrees in down.items() if abs(degrees) > 1}
     if tilted:
         remedy = "; ".join(trial.lines([i], remedies.mount, after=turn) for i, turn in tilted.items())
         turns = np.array([tilted.get(index, np.eye(3)) for index in trial.every])[:, None]
         what = "the tilt of every camera has the wrong sign"
-        yield trial.posed("mount", what, remedy, rotation @ turns, group=list(tilted))
+        yield trial.posed("mount", what, remedy, (list(tilted), PRICE_OF_ALL), rotation @ turns)
 
 
 _MEANT = {
@@ -453,9 +440,10 @@ def _gimbals(trial: Trial) -> Iterator[Alternative]:
             turned[index] = frames[meant] @ frames[relative_to].mT @ rotation[index]
             group.append(index)
         rows += [(group, stated, f"relative_to: {meant}", turned)] if group else []
-    for group, what, line, turned in rows:
+    for group, stated, line, turned in rows:
         remedy = "; ".join(f"cameras.{name}.gimbal.{line}" for name in trial.named(group))
-        yield trial.posed("gimbal", f"the gimbals' angles are {what}", remedy, turned, group=group)
+        what = f"the gimbals' angles are {stated}"
+        yield trial.posed("gimbal", what, remedy, (group, PRICE_OF_ALL), turned)
 
 
 def _frames(body: Float) -> dict[str, Float]:
@@ -468,22 +456,18 @@ def _frames(body: Float) -> dict[str, Float]:
     }
 
 
-def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternative]:
-    """Try other meanings of the logged poses: axes, inverses, orders of quaternions.
-
-    `kind` are the cameras with logs of one kind, or one camera; None for all that move.
-    """
-    moving = trial.moving if kind is None else kind
-    price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
+def _conventions(trial: Trial, of: Group) -> Iterator[Alternative]:
+    """Try other meanings of the logged poses: axes, inverses, orders of quaternions."""
+    moving = trial.moving if of[0] is None else of[0]
     mounts, camera, place = trial.mounts, trial.described.rotation, trial.described.position
     body, on_gimbal = trial.bodies
 
     def carried_by(bodies: Float) -> Float:
         """Return the attitudes [C, T, 3, 3] of the cameras on bodies that are turned otherwise."""
         turned = bodies @ mounts
-        for index, of in on_gimbal.items():
-            if of is not None:
-                before, after = _frames(body[index])[of], _frames(bodies[index])[of]
+        for index, base in on_gimbal.items():
+            if base is not None:
+                before, after = _frames(body[index])[base], _frames(bodies[index])[base]
                 turned[index] = after @ before.mT @ camera[index]
         return turned
 
@@ -492,7 +476,7 @@ def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternati
     axes, frame = ("enu", "FLU") if held[0].axes == "ned" else ("ned", "FRD")
     in_axes, z = f"the poses are in {axes.upper()}, of", "up" if held[0].z == "down" else "down"
     of_camera, of_body = (
-        f"world_from_{of}" if held[0].inverse else f"{of}_from_world" for of in ("camera", "body")
+        f"world_from_{each}" if held[0].inverse else f"{each}_from_world" for each in ("camera", "body")
     )
     back, body_back, ned = camera.mT, body.mT, place @ _ENU_FROM_NED.T
     origin, body_origin = (-np.einsum("ctij,ctj->cti", each, place) for each in (back, body_back))
@@ -524,20 +508,19 @@ def _conventions(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternati
     for code, what, options, rotation, position in table:
         again = f"write the log again, since {what}"
         remedy = trial.lines(moving, remedies.pose, options) if options else again
-        yield trial.posed(code, what, remedy, rotation, position, group=kind, price=price)
+        yield trial.posed(code, what, remedy, of, rotation, position)
     if any(poses.mount for poses in held):
         # Of poses of the camera itself, it would be a roll by 180 deg.
         remedy = trial.lines(moving, remedies.mount, before=_FLU_FROM_FRD)
         what, turned = "the body's axes are FRD (forward, right, down)", body @ _FLU_FROM_FRD @ mounts
-        yield trial.posed("axes", what, remedy, turned, group=kind, price=price)
+        yield trial.posed("axes", what, remedy, of, turned)
 
 
-def _units(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternative]:
+def _units(trial: Trial, of: Group) -> Iterator[Alternative]:
     """Try other units of the logged positions, of cameras as in `_conventions`."""
-    moving = trial.moving if kind is None else kind
-    price = PRICE_OF_ALL if kind is None else PRICE_OF_ONE
+    moving = trial.moving if of[0] is None else of[0]
     camera, place = trial.described.rotation, trial.described.position
-    whose = "" if kind is None else f" of {', '.join(trial.named(kind))}"
+    whose = "" if of[0] is None else f" of {', '.join(trial.named(of[0]))}"
     # Lever arms are stated in metres, whatever the log's unit.
     levers = np.array([each.lever_m for each in trial.cameras])
     arms = np.einsum("ctij,cj->cti", trial.bodies[0], levers)
@@ -545,8 +528,8 @@ def _units(trial: Trial, kind: Sequence[int] | None) -> Iterator[Alternative]:
         again = f", and {1 / metres:.4g} times what is read"
         for unit, factor, known in ((name, metres, ""), ("m", 1 / metres, again)):
             what, there = f"the positions{whose} are in {unit}{known}", (place - arms) * factor + arms
-            remedy, same = trial.lines(moving, remedies.pose, f"unit: {unit}"), kind is None
-            yield trial.posed("unit", what, remedy, camera, there, group=kind, price=price, same_scatter=same)
+            remedy = trial.lines(moving, remedies.pose, f"unit: {unit}")
+            yield trial.posed("unit", what, remedy, of, camera, there)
 
 
 # What is mirrored, if a detector does it alike in all pictures, its price, and its sentence.
@@ -570,7 +553,7 @@ def _keypoints(trial: Trial) -> Iterator[Alternative]:
             yield Alternative("keypoints_size", named, what, remedy, price, scene)
         for value, (of_all, dearer, what) in _MIRRORED.items():
             if not (one and of_all):
-                scene = trial.with_pixels(group, mirrored=remedies.MIRRORS[value])
+                scene = trial.with_pixels(group, flipped=remedies.MIRRORS[value])
                 remedy = remedies.mirrored([trial.cameras[index] for index in group], value)
                 yield Alternative("mirrored", named, what.format(whose), remedy, price + dearer, scene)
 
@@ -706,7 +689,7 @@ def _of_numbers(
         evidence["shift_sigma_m"] = round(float(np.sqrt(variance[:3].sum())), 2)
     if kind not in ("shift", "focal") and variance.size:
         evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
-    price = PRICE_OF_ONE if len(group) < len(trial.names) else _OF_ALL[kind]
+    price = _PRICE_OF_ONE if len(group) < len(trial.names) else _OF_ALL[kind]
     return Alternative(code, trial.named(group), what, remedy, price, evidence=evidence)
 
 
@@ -727,7 +710,7 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
     flight, scene = trial.flight, trial.described
     is_fixed = flight.hips is not None or len(trial.moving) < len(trial.names)
     moved = trial.moving if is_fixed else trial.moving[1:]
-    away_m = scene.focal_px * STATURE_M * _NOSE_TO_ANKLES / np.maximum(scene.person_px, 1.0)
+    away_m = scene.focal_px * STATURE_M * NOSE_TO_ANKLES / np.maximum(scene.person_px, 1.0)
     rays = np.concatenate([scene.rays[:, :, HIPS], np.ones((*scene.rays.shape[:2], 2, 1))], axis=-1)
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).mean(axis=2)
     seen = scene.position + away_m[:, None, None] * np.einsum("ctij,ctj->cti", scene.rotation, rays)

@@ -167,13 +167,13 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
     doubts = []
     for name, found in moved.items():
         late_s, sigma_s = float(found["offset_s"]), float(found["sigma_s"])
-        offset = remedies.offset_of(description.cameras[name], late_s)
+        offset_s = description.cameras[name].clock.offset_s + late_s
         either = found["by"] == "keypoints" and len(description.cameras) == 2
         beside = ", though the other camera's clock may be the wrong one" if either else ""
         what = f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
         what += f" {evidence[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}"
         known = {"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)}
-        remedy = "" if beside else f"cameras.{name}.{offset}"
+        remedy = "" if beside else f"cameras.{name}.clock.offset_s: {offset_s:.3f}"
         doubts.append(Doubt(code="clock", cameras=[name], what=what, evidence=dict(known), remedy=remedy))
     return doubts
 
@@ -334,7 +334,7 @@ class Objective:
         """Search the clock of one camera, or of all: a grid, then ever smaller steps about its best."""
 
         def at(late_s: float) -> tuple[Tried, float]:
-            return self.scored(alternatives.clock(self.trial, group, late_s)), late_s
+            return self.scored(alternatives.of_times(self.trial, group, late_s)), late_s
 
         step_s = _CLOCK_STEP_S
         grid = np.arange(-_LONGEST_CLOCK_S, _LONGEST_CLOCK_S + step_s / 2, step_s)
@@ -506,7 +506,8 @@ def _below_zero(objective: Objective) -> list[Tried]:
         return []
     what = "all drones fly below zero: their positions count z downwards, or zero is high above the ground"
     remedy = trial.lines(trial.moving, remedies.pose, remedies.upside_down)
-    below = trial.posed("axes", what, remedy, trial.described.rotation, place * [1.0, 1.0, -1.0])
+    above = place * [1.0, 1.0, -1.0]
+    below = trial.posed("axes", what, remedy, (None, PRICE_OF_ALL), trial.described.rotation, above)
     turned = objective.scored(below)
     return [turned] if turned.total <= objective.base.total + _ALIKE + PRICE_OF_ALL else []
 
@@ -535,11 +536,8 @@ def _of_turns(objective: Objective, tried: Sequence[Lateness]) -> list[Tried]:
     if late.gain < LEAST_GAIN or (late.slower == 1 and not is_sure_clock(late)):
         return []
     group, evidence = list(late.cameras), {"turning_gain": round(late.gain, 1)}
-    if late.slower != 1:
-        seen = alternatives.rate(trial, group, late.slower)
-    else:
-        seen = alternatives.clock(trial, group, late.late_s)
-        evidence["clock_sigma_s"] = round(late.sigma_s, 3)
+    evidence |= {"clock_sigma_s": round(late.sigma_s, 3)} if late.slower == 1 else {}
+    seen = alternatives.of_times(trial, group, late.late_s, late.slower)
     what = f"{seen.what}, as the turning of their backgrounds shows"
     return [Tried(replace(seen, what=what, scene=None, evidence=evidence))]
 
@@ -619,6 +617,7 @@ _UNUSUAL = {
     "crossed": ("body", "limbs cross: left and right are exchanged in the names of some joints, not of all"),
     "bend": ("body", "knees or elbows bend the wrong way"),
     "course": ("body", "the person walks sideways or backwards"),
+    "slide": ("body", "the foot that stands slides, with {foot_mps:.1f} m/s"),
     "tread": ("body", "legs go at {legs_over_pace:.1f} times the pace: the standing foot slides"),
     "speed": ("body", "the person is faster than people run: {pace_mps:.1f} m/s"),
     "above": ("ground", "the person is {above_m:.1f} m above the drones"),
@@ -633,6 +632,7 @@ _UNUSUAL = {
     "actor_path": ("actor", "the person takes another way than the logged actor, {path_apart_m:.1f} m apart"),
     "unused": ("residual", "{unused_share:.0%} of the joints cannot be used: their rays miss each other"),
     "behind": ("residual", "joints are behind the cameras that see them"),
+    "parallax": ("residual", "the cameras look from the same side: the rays hardly cross"),
 }
 # What is less odd than this many standard deviations is not worth a sentence.
 _LEAST_UNUSUAL = 2.0

@@ -36,8 +36,30 @@ _ONE_BODY_DEG = 45.0
 def doubts_of_logs(cameras: Mapping[str, tuple[CameraEntry, Trajectory]]) -> list[Doubt]:
     """Find cameras that fly the same path, or whose logs start at the same place."""
     moving = {name: camera for name, camera in cameras.items() if not camera[0].poses.static}
-    found = (_doubt_of_two(dict(pair)) for pair in combinations(moving.items(), 2))
-    return [doubt for doubt in found if doubt is not None]
+    doubts = []
+    for (first, (entry, one)), (second, (beside, other)) in combinations(moving.items(), 2):
+        start, end = max(one.t_ns[0], other.t_ns[0]), min(one.t_ns[-1], other.t_ns[-1])
+        if start >= end:
+            continue
+        t_ns = start + np.linspace(0, end - start, _MOMENTS).astype(np.int64)
+        places, turns = zip(*(_poses_at(track, t_ns) for track in (one, other)), strict=True)
+        apart_m = float(np.median(np.linalg.norm(places[0] - places[1], axis=1)))
+        cosine = np.clip(np.abs((turns[0] * turns[1]).sum(axis=1)), 0, 1)
+        turned_deg = float(np.median(np.degrees(2 * np.arccos(cosine))))
+        starts_apart_m = float(np.linalg.norm(one.position[0] - other.position[0]))
+        poses = entry.poses, beside.poses
+        one_source = (poses[0].source, poses[0].topic) == (poses[1].source, poses[1].topic)
+        pair, apart = (first, second), round(apart_m, 3)
+        if apart_m < _SAME_PATH_M and (turned_deg < _ONE_BODY_DEG or one_source):
+            what = f"{first} and {second} fly the same path: one of them has the other's topic or log"
+            remedy = _topic({first: entry, second: beside})
+            doubts.append(_doubt("pose", pair, what, remedy, apart_m=apart, turned_deg=round(turned_deg, 2)))
+        elif starts_apart_m < _SAME_START_M and (apart_m > _SAME_START_M or turned_deg > _ONE_BODY_DEG):
+            what = f"{first} and {second} start at the same place: each log counts from its own start"
+            remedy = f"cameras.{second}.pose.world_from_source: {{translation: [east, north, up]}}"
+            starts_m = round(starts_apart_m, 3)
+            doubts.append(_doubt("origin", pair, what, remedy, starts_apart_m=starts_m, apart_m=apart))
+    return doubts
 
 
 def doubt_of_unit(cameras: Mapping[str, Trajectory], units: Mapping[str, str | None]) -> Doubt | None:
@@ -125,33 +147,6 @@ def _elsewhere(place: Float) -> str:
     return f"about x {x_m:.0f} m, y {y_m:.0f} m, {reason}"
 
 
-def _doubt_of_two(pair: Mapping[str, tuple[CameraEntry, Trajectory]]) -> Doubt | None:
-    one, other = (track for _, track in pair.values())
-    start, end = max(one.t_ns[0], other.t_ns[0]), min(one.t_ns[-1], other.t_ns[-1])
-    if start >= end:
-        return None
-    t_ns = start + np.linspace(0, end - start, _MOMENTS).astype(np.int64)
-    places, turns = zip(*(_poses_at(track, t_ns) for track in (one, other)), strict=True)
-    apart_m = float(np.median(np.linalg.norm(places[0] - places[1], axis=1)))
-    cosine = np.clip(np.abs((turns[0] * turns[1]).sum(axis=1)), 0, 1)
-    turned_deg = float(np.median(np.degrees(2 * np.arccos(cosine))))
-    starts_apart_m = float(np.linalg.norm(one.position[0] - other.position[0]))
-    first, second = pair
-    poses = [entry.poses for entry, _ in pair.values()]
-    one_source = (poses[0].source, poses[0].topic) == (poses[1].source, poses[1].topic)
-    if apart_m < _SAME_PATH_M and (turned_deg < _ONE_BODY_DEG or one_source):
-        what = f"{first} and {second} fly the same path: one of them has the other's topic or log"
-        remedy = _topic({name: entry for name, (entry, _) in pair.items()})
-        turned_deg = round(turned_deg, 2)
-        return _doubt("pose", pair, what, remedy, apart_m=round(apart_m, 3), turned_deg=turned_deg)
-    if starts_apart_m < _SAME_START_M and (apart_m > _SAME_START_M or turned_deg > _ONE_BODY_DEG):
-        what = f"{first} and {second} start at the same place: each log counts from its own start"
-        remedy = f"cameras.{second}.pose.world_from_source: {{translation: [east, north, up]}}"
-        starts_apart_m = round(starts_apart_m, 3)
-        return _doubt("origin", pair, what, remedy, starts_apart_m=starts_apart_m, apart_m=round(apart_m, 3))
-    return None
-
-
 def _poses_at(track: Trajectory, t_ns: Int64) -> tuple[Float, Float]:
     """Interpolate positions [N, 3] and rotations [N, 4], also across gaps of the log."""
     gap_ns = int(track.t_ns[-1] - track.t_ns[0]) + 1
@@ -162,16 +157,13 @@ def _topic(pair: Mapping[str, CameraEntry]) -> str:
     """Return the pose of the camera that has the other's, where names tell it; else ask for both."""
     for name, other in (tuple(pair), tuple(pair)[::-1]):
         poses = pair[name].poses
-        stated = poses.topic or poses.source
-        if other in stated and name not in stated:
-            lines = [f"pose.{'topic' if poses.topic else 'file'}: {stated.replace(other, name)}"]
-            if poses.topic and other in poses.source:
-                lines.insert(0, f"pose.file: {poses.source.replace(other, name)}")
-            gimbals = (("file", poses.gimbal_log), ("topic", poses.gimbal_topic))
-            lines += [
-                f"gimbal.{key}: {value.replace(other, name)}"
-                for key, value in gimbals
-                if value is not None and other in value and name not in value
-            ]
-            return "; ".join(f"cameras.{name}.{line}" for line in lines)
+        pose = poses.topic or poses.source
+        if other in pose and name not in pose:
+            stated = {"pose.file": poses.source, "pose.topic": poses.topic}
+            stated |= {"gimbal.file": poses.gimbal_log, "gimbal.topic": poses.gimbal_topic}
+            return "; ".join(
+                f"cameras.{name}.{key}: {value.replace(other, name)}"
+                for key, value in stated.items()
+                if value and other in value and (key == "pose.file" or name not in value)
+            )
     return "; ".join(f"cameras.{name}.pose: {{file: ..., topic: ...}}  # that of {name}" for name in pair)

@@ -15,7 +15,7 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import Looks, body_from_camera
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.reconstruction.observations import Filmed
-from pipelines.session.description import CameraEntry, PosesEntry
+from pipelines.session.description import PosesEntry
 
 Options = str | Callable[[PosesEntry], str]
 """How poses are written, beside how they are read."""
@@ -33,12 +33,7 @@ def lines(cameras: Iterable[Filmed], line_of: Callable[..., str], *values: Any, 
 
 def clock(camera: Filmed, seconds: float) -> str:
     """Move the clock of a camera's pictures."""
-    return offset_of(camera.entry, seconds)
-
-
-def offset_of(entry: CameraEntry, seconds: float) -> str:
-    """State a clock's offset that is larger by some seconds."""
-    return f"clock.offset_s: {entry.clock.offset_s + seconds:.3f}"
+    return f"clock.offset_s: {camera.entry.clock.offset_s + seconds:.3f}"
 
 
 def frame_rate(camera: Filmed, factor: float) -> str:

@@ -16,6 +16,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.noise import WHITE_SHARE, Drift, GaussMarkov, NoiseModel, White
 from pipelines.geometry.poses import interpolate_points
+from pipelines.geometry.rig import unit
 from pipelines.reconstruction.observations import UNSTATED, Camera, Filmed, PoseSigma
 from pipelines.session.camera_poses import stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
@@ -38,11 +39,10 @@ HIPS = [JOINTS.index("left_hip"), JOINTS.index("right_hip")]
 """The indices of the hips among them."""
 
 MOMENTS = 60
-"""Moments of the flight that are looked at, in pairs of `STEP_NS`."""
+"""Moments of the flight that are looked at, in pairs 0.1 s apart."""
 
-STEP_NS = 100_000_000
-"""Between the two moments of a pair, for speeds."""
-
+# Between the two moments of a pair, for speeds.
+_STEP_NS = 100_000_000
 # The logged hips of an actor err by this much.
 PLACED_M = 0.3
 # Errors of a logged actor wander, and count as so many independent ones.
@@ -153,16 +153,16 @@ def sample(
         filmed.append(Filmed(camera.name, camera.intrinsics, t_ns, pixels, camera, entry, sigma))
     start = max(int(camera.t_ns[0]) for camera in filmed)
     end = min(int(camera.t_ns[-1]) for camera in filmed)
-    if end - start <= STEP_NS:
+    if end - start <= _STEP_NS:
         return None
-    before = np.linspace(start, end - 1.1 * STEP_NS, MOMENTS // 2).astype(np.int64)
-    t_ns = np.sort(np.concatenate([before, before + STEP_NS]))
+    before = np.linspace(start, end - 1.1 * _STEP_NS, MOMENTS // 2).astype(np.int64)
+    t_ns = np.sort(np.concatenate([before, before + _STEP_NS]))
     return Sampled(
         tuple(filmed),
         description.pose_interpolation,
         t_ns,
         np.searchsorted(t_ns, before),
-        np.searchsorted(t_ns, before + STEP_NS),
+        np.searchsorted(t_ns, before + _STEP_NS),
         None if actor is None else actor.hips_at(t_ns),
         None if last_map is None else GroundOfMap.of(last_map),
         actor,
@@ -233,8 +233,7 @@ def scene_of(
     flight: Sampled,
     posed: SceneOfMoments | None = None,
     *,
-    late_s: Float | None = None,
-    slower: Float | None = None,
+    times: Mapping[int, tuple[float, float]] | None = None,
     order: tuple[int, ...] | None = None,
     pixels: list[Float] | None = None,
 ) -> SceneOfMoments:
@@ -243,8 +242,7 @@ def scene_of(
     Args:
         flight: the flight.
         posed: the scene as described, of which everything else is taken.
-        late_s: [C] added to the times of each camera's pictures.
-        slower: [C] factor of the times between each camera's pictures.
+        times: of cameras by index, seconds added to the times of pictures, and a factor between these.
         order: whose pictures each camera has; its own by default.
         pixels: other pixels [F, J, 2] of each camera's pictures.
     """
@@ -255,7 +253,7 @@ def scene_of(
     for index, camera in enumerate(cameras):
         source = cameras[index if order is None else order[index]]
         seen = source.pixels if pixels is None else pixels[index]
-        late, factor = 0.0 if late_s is None else late_s[index], 1.0 if slower is None else slower[index]
+        late, factor = (times or {}).get(index, (0.0, 1.0))
         if posed is not None and seen is camera.pixels and (late, factor) == (0.0, 1.0):
             rays[index] = posed.rays[index]
             person_px.append(posed.person_px[index])
@@ -383,10 +381,6 @@ def trunk_direction(joints: Float) -> Float:
     return known.mean(axis=0) if len(known) > _FEWEST_MOMENTS else np.full(3, np.nan)
 
 
-def _unit(vectors: Float) -> Float:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
 def _dot(one: Float, other: Float) -> Float:
     return np.asarray((one * other).sum(axis=-1))
 
@@ -405,7 +399,7 @@ class Body:
     @cached_property
     def upwards(self) -> Float:
         """Return the unit vectors [T, 3] from the hips to the shoulders."""
-        return _unit(self.shoulders - self.hips)
+        return unit(self.shoulders - self.hips)
 
     @cached_property
     def forwards(self) -> Float:
@@ -415,7 +409,7 @@ class Body:
     @cached_property
     def cosine(self) -> Float:
         """Return the cosine [T] of the body against the vertical."""
-        return _unit(self.shoulders - (self["left_ankle"] + self["right_ankle"]) / 2)[:, 2]
+        return unit(self.shoulders - (self["left_ankle"] + self["right_ankle"]) / 2)[:, 2]
 
     @cached_property
     def lengths(self) -> list[tuple[Float, float]]:
@@ -456,7 +450,7 @@ class Body:
             "crossed": Oddity(max(0.0, 0.5 - same_sides) / 0.03, {"uncrossed_share": same_sides}),
             "bend": Oddity(max(0.0, 0.4 - bent) / 0.06, {"bent_forwards_share": bent}),
         }
-        nose = _dot(self["nose"] - (self["left_ear"] + self["right_ear"]) / 2, _unit(self.forwards))
+        nose = _dot(self["nose"] - (self["left_ear"] + self["right_ear"]) / 2, unit(self.forwards))
         wide = np.linalg.norm(self["left_ear"] - self["right_ear"], axis=-1)
         nose = nose[np.abs(nose) > _AHEAD_OF_EARS * wide]
         if len(nose) > _FEWEST_MOMENTS:
@@ -470,17 +464,17 @@ class Body:
         A knee is ahead of the line from hip to ankle, an elbow behind that from shoulder to wrist. What is
         hardly bent, or bent sideways, does not count; 1 where few are bent.
         """
-        forwards, shares = _unit(self.forwards), []
+        forwards, shares = unit(self.forwards), []
         for root, middle, tip, sign in (("hip", "knee", "ankle", 1), ("shoulder", "elbow", "wrist", -1)):
             right: list[Bool] = []
             for side in ("left", "right"):
                 upper = self[f"{side}_{middle}"] - self[f"{side}_{root}"]
                 lower = self[f"{side}_{tip}"] - self[f"{side}_{middle}"]
-                line = _unit(upper + lower)
-                ahead = sign * _dot(_unit(upper - _dot(upper, line)[:, None] * line), forwards)
-                counts = (_dot(_unit(upper), _unit(lower)) < _BENT_COSINE) & (np.abs(ahead) > _CLEARLY)
+                line = unit(upper + lower)
+                ahead = sign * _dot(unit(upper - _dot(upper, line)[:, None] * line), forwards)
+                counts = (_dot(unit(upper), unit(lower)) < _BENT_COSINE) & (np.abs(ahead) > _CLEARLY)
                 if middle == "elbow":
-                    counts &= -_dot(_unit(upper), self.upwards) > _HANGING
+                    counts &= -_dot(unit(upper), self.upwards) > _HANGING
                 right.append(ahead[counts] > 0)
             if sum(map(len, right)) > _FEWEST_MOMENTS:
                 shares.append(float(np.concatenate(right).mean()))
@@ -493,8 +487,9 @@ class Body:
             for joint in ("shoulder", "elbow", "hip", "knee")
         }
         pairs = (("shoulder", "elbow"), ("hip", "knee"), ("shoulder", "hip"))
-        along = [finite(_dot(across[one], across[other])) for one, other in pairs]
-        return min((float((each > 0).mean()) for each in along if each.size > _FEWEST_MOMENTS), default=1.0)
+        along = [_dot(across[one], across[other]) for one, other in pairs]
+        known = [each[np.isfinite(each)] for each in along]
+        return min((float((each > 0).mean()) for each in known if each.size > _FEWEST_MOMENTS), default=1.0)
 
     def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, Oddity]:
         """Measure how oddly the person moves: not forwards, faster than people, or on feet that slide.
@@ -505,37 +500,39 @@ class Body:
             white_m: by how much pose errors that are new in every pose move the person.
             keypoint_m: by how much keypoints' errors move a joint.
         """
-        step_s = STEP_NS / 1e9
+        step_s = _STEP_NS / 1e9
         noise = np.sqrt(2) * white_m / step_s  # m/s
         moved = (self.hips[flight.second] - self.hips[flight.first])[:, :2]
         pace = np.linalg.norm(moved, axis=-1) / step_s
         of_foot = float(np.hypot(noise, np.sqrt(2) * keypoint_m / step_s))
+        feet = [
+            self[name][flight.second] - self[name][flight.first] for name in ("left_ankle", "right_ankle")
+        ]
+        slid = median(np.minimum(*(np.linalg.norm(foot, axis=-1) / step_s for foot in feet)))
+        slides = max(0.0, slid - 0.4 * stature / 1.7 - of_foot) / (0.5 + of_foot / 2)
         fast, ahead = quantile(pace, 0.75), self._ahead(flight, white_m)
         return {
             "course": Oddity(max(0.0, 0.5 - ahead) / 0.15, {"course_cosine": ahead}),
             "speed": Oddity(max(0.0, fast - 4.0 - 1.5 * noise) / (2 + noise), {"pace_mps": fast}),
-            "tread": self._tread(flight, stature, of_foot),
+            "slide": Oddity(slides, {"foot_mps": slid}),
+            "tread": self._tread(flight, stature, of_foot, feet),
         }
 
-    def _tread(self, flight: Sampled, stature: float, noise_mps: float) -> Oddity:
+    def _tread(self, flight: Sampled, stature: float, noise_mps: float, feet: list[Float]) -> Oddity:
         """Compare how fast the standing foot is left behind with how fast the person walks.
 
-        It stands still, so both are alike in a world of any scale, but not with a wrong focal length, or at
-        a wrong rate of pictures. Where moments are too far apart to tell the way, nothing is odd.
+        The steps of `feet` [T, 3] m are those of a pair of moments. A foot stands still, so both are alike in
+        a world of any scale, but not with a wrong focal length, or at a wrong rate of pictures. Where moments
+        are too far apart to tell the way, nothing is odd.
         """
         t_ns, first, second = flight.t_ns, flight.first, flight.second
         before = np.searchsorted(t_ns, t_ns[first] - _TREAD_NS)
         after = np.searchsorted(t_ns, t_ns[second] + _TREAD_NS, side="right") - 1
         way = (self.hips[after] - self.hips[before])[:, :2]
         way_m, way_s = np.linalg.norm(way, axis=1), (t_ns[after] - t_ns[before]) / 1e9
-        left_m = np.minimum(
-            *(
-                ((self[name][second] - self[name][first])[:, :2] * way).sum(axis=1) / way_m
-                for name in ("left_ankle", "right_ankle")
-            )
-        )
-        pace, legs = way_m / way_s, way_m / way_s - left_m / (STEP_NS / 1e9)
-        known = np.isfinite(legs) & (pace > _LEAST_TREAD_MPS) & (way_s > 3 * STEP_NS / 1e9)
+        left_m = np.minimum(*(_dot(foot[:, :2], way) / way_m for foot in feet))
+        pace, legs = way_m / way_s, way_m / way_s - left_m / (_STEP_NS / 1e9)
+        known = np.isfinite(legs) & (pace > _LEAST_TREAD_MPS) & (way_s > 3 * _STEP_NS / 1e9)
         if known.sum() < _FEWEST_TREADS:
             return Oddity(0.0, {})
         walked = float(pace[known].mean())
@@ -550,7 +547,7 @@ class Body:
         first = np.arange(len(flight.t_ns))
         second = np.searchsorted(flight.t_ns, flight.t_ns + _WALK_NS, side="right") - 1
         step_s = (flight.t_ns[second] - flight.t_ns[first]) / 1e9
-        forwards = _unit((self.forwards[first] + self.forwards[second])[:, :2])
+        forwards = unit((self.forwards[first] + self.forwards[second])[:, :2])
         moved = (self.hips[second] - self.hips[first])[:, :2]
         along = _dot(moved, forwards)
         across = forwards[:, 0] * moved[:, 1] - forwards[:, 1] * moved[:, 0]
@@ -569,12 +566,7 @@ class Body:
         return ahead / pace if pace > _LEAST_PACE_MPS + 3 * white_m * np.sqrt(2 / weight) else 1.0
 
 
-def finite(values: Float) -> Float:
-    """Return the finite values."""
-    return values[np.isfinite(values)]
-
-
 def quantile(values: Float, share: float) -> float:
     """Return a quantile of what is finite."""
-    ordered = np.sort(finite(values))
+    ordered = np.sort(values[np.isfinite(values)])
     return float(ordered[int(share * (ordered.size - 1))]) if ordered.size else float("nan")

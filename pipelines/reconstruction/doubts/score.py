@@ -481,6 +481,9 @@ def score(
     freedom, gate = 2 * solved.views[good] - 3, (_UNUSED_SIGMAS * max(misfit, 1.0)) ** 2
     unused = float((solved.chi2[good] > gate * freedom).mean())
     odd["unused"] = Oddity(max(0.0, unused - _USUALLY_UNUSED) / 0.05, {"unused_share": unused})
+    sine = _best_sine(solved)
+    parallax = {"parallax_deg": float(np.degrees(np.arcsin(sine)))}
+    odd["parallax"] = Oddity(max(0.0, 0.1 / max(sine, 1e-4) - 1), parallax)
     odd = {name: each for name, each in odd.items() if np.isfinite(each.sigmas)}
     total += sum(surprise(each) for each in odd.values())
     odd |= {"behind": behind, "unposed": unposed(scene)}
@@ -510,6 +513,17 @@ def _misfit(solved: SolvedJoints, good: Bool) -> float:
         among = good & (freedom == value)
         total += among.sum() * median(solved.chi2[among]) / value / _CHI2_MEDIAN.get(int(value), 0.9)
     return float(np.sqrt(total / good.sum()))
+
+
+def _best_sine(solved: SolvedJoints) -> float:
+    """Return the sine of the angle at which the rays of the best pair of cameras cross."""
+    sine = 0.0
+    for one, other in combinations(range(len(solved.seen)), 2):
+        both = solved.seen[one] & solved.seen[other]
+        if both.any():
+            cosine = (solved.direction[one][both] * solved.direction[other][both]).sum(axis=-1)
+            sine = max(sine, median(np.sqrt(np.maximum(0.0, 1.0 - cosine**2))))
+    return sine
 
 
 def _scatter(scene: SceneOfMoments, solved: SolvedJoints, pair: tuple[int, int]) -> float | None:
