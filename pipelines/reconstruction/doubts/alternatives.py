@@ -305,7 +305,7 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
     truth, if there is one, says which line changes no more than is wrong.
     """
     flight, described = trial.flight, trial.described
-    # Any scale makes the person as tall as people are: that much surer the stature makes it (see `_freedom`).
+    # Any scale makes the person as tall as people are: that much surer the stature makes it.
     price = PRICE_OF_ALL + np.log(1 / SIZE_SIGMA) / 2 + dearer
     size = STATURE_M / stature
     by_actor, sigma = _scaled_to_actor(trial, joints, size)
@@ -316,17 +316,18 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
     if flight.truth_m is not None:
         alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
     for of_poses in (alone, not alone) if flight.truth_m is None and trial.located else (alone,):
-        factor, code, cost, remedy = size, "scale", price, f"world.scale: {size:.3g}"
-        placed, evidence = flight.scaled(size), {"scale_sigma_share": SIZE_SIGMA}
-        if of_poses:
-            factor, placed, evidence["scale_sigma_share"] = by_actor, flight, round(sigma, 3)
-            remedy = trial.lines(trial.every, remedies.placed, np.zeros(3), factor=by_actor)
-        what = f"all positions are {1 / factor:.2g} times what they should be:"
-        what += f" the person is {stature:.3g} m tall"
+        placed = flight if of_poses else flight.scaled(size)
         if of_poses and unit is not None:
-            factor, code, evidence, cost = _UNITS_M[unit], "unit", {}, PRICE_OF_ALL
+            factor, code, cost, evidence = _UNITS_M[unit], "unit", PRICE_OF_ALL, {}
             what = f"the positions are in {unit}"
             remedy = trial.lines(trial.every, remedies.pose, f"unit: {unit}")
+        else:
+            factor, share = (by_actor, sigma) if of_poses else (size, SIZE_SIGMA)
+            code, cost, evidence = "scale", price, {"scale_sigma_share": round(share, 3)}
+            what = f"all positions are {1 / factor:.2g} times what they should be:"
+            what += f" the person is {stature:.3g} m tall"
+            of_logs = trial.lines(trial.every, remedies.placed, np.zeros(3), factor=factor)
+            remedy = of_logs if of_poses else f"world.scale: {size:.3g}"
         # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
         of_places = np.array([factor, 1.0] * 3)
         scene = replace(described, position=described.position * factor, sigma=described.sigma * of_places)

@@ -24,14 +24,9 @@ from pipelines.session.people import LoggedActor
 from pipelines.session.records import Occupancy
 
 JOINTS = (
-    "nose",
-    "left_ear",
-    "right_ear",
-    *(
-        f"{side}_{joint}"
-        for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-        for side in ("left", "right")
-    ),
+    *("nose", "left_ear", "right_ear"),
+    *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+    *("left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
 )
 """The joints that are looked at; every skeleton of people has most of them."""
 
