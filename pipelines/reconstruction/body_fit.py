@@ -3,7 +3,8 @@
 Landmarks are a detector's keypoints as points that are fixed to a bone (`data/landmarks.csv`, made by
 `tools/body_landmarks.py`). How far a landmark of one body lies from its place in the table is constant over a
 flight and unknown: such offsets are estimated with the shape, with the table's spread as prior. So shape and
-pose do not seem surer than landmarks are.
+pose do not seem surer than landmarks are. Landmarks vary together: over bare legs both ankles, heels and
+knees lie higher than over trousers. The table has the principal modes of this (factor analysis).
 
 The fit is a maximum a posteriori estimate: joints with their covariances and the spread of landmarks between
 pictures, bounded (Cauchy); a prior of the shape; and the range of every joint, as a wide normal distribution
@@ -32,7 +33,6 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES, unit
-from pipelines.session.people import mirrored
 
 _TABLE = Path(__file__).parent / "data" / "landmarks.csv"
 
@@ -43,11 +43,6 @@ MIN_LANDMARKS = 10
 # A detector misplaces landmarks for as long as a posture lasts: with moments so far apart, errors of statures
 # are as large as stated on the tuning flights (2 s), and larger than stated with 0.4 s.
 _INDEPENDENT_S = 2.0
-# Correlation of the offsets of a face's, a hand's or a foot's landmarks on the tuning flights.
-_ALIKE_IN_A_GROUP = 0.85
-# Correlation of left and right offsets along a limb there: 0.2 to 0.9. Taken for independent, they would
-# average, and make statures seem surer.
-_ALIKE_ON_BOTH_SIDES = 0.6
 # More moments hardly make the shape surer, because offsets of landmarks stay.
 _MOST_MOMENTS = 200
 # Poses of so many moments at once take 50 MB.
@@ -102,7 +97,8 @@ class Landmarks:
     joints: tuple[str, ...]
     bone: Index  # [K]
     offset: Float  # [K, 3] from the bone's joint, neutral axes, relative to the stature
-    body_sigma: Float  # [K] spread of the offset between bodies, relative to the stature
+    body_sigma: Float  # [K, 3] spread of the offset between bodies beside the modes, relative to the stature
+    modes: Float  # [K, 3, M] offsets that vary together, 1 is a standard deviation, relative to the stature
     picture_sigma: Float  # [K] spread within a flight, relative to the stature
 
     @property
@@ -120,7 +116,8 @@ def _tables() -> dict[str, Landmarks]:
             tuple(rows["joint"]),
             np.array([BONE[name] for name in rows["bone"]]),
             rows[["x", "y", "z"]].to_numpy(np.float64),
-            rows["body_sigma"].to_numpy(np.float64),
+            rows[["sx", "sy", "sz"]].to_numpy(np.float64),
+            rows.filter(regex="^mode").to_numpy(np.float64).reshape(len(rows), 3, -1),
             rows["picture_sigma"].to_numpy(np.float64),
         )
     return found
@@ -134,10 +131,8 @@ def landmarks_of(joints: Sequence[str]) -> tuple[Landmarks, Index] | None:
     if len(kept) < MIN_LANDMARKS or not set(_TRUNK).issubset(names):
         return None
     columns = np.array([list(joints).index(name) for name in names], dtype=np.intp)
-    chosen = Landmarks(
-        tuple(names), table.bone[kept], table.offset[kept], table.body_sigma[kept], table.picture_sigma[kept]
-    )
-    return chosen, columns
+    spread = table.body_sigma[kept], table.modes[kept], table.picture_sigma[kept]
+    return Landmarks(tuple(names), table.bone[kept], table.offset[kept], *spread), columns
 
 
 @dataclass(frozen=True)
@@ -435,20 +430,17 @@ def _spread(slope: Float, by_shared: Float, covariance: Float, shared_covariance
     return np.asarray(own + _carried(by_shared, shared_covariance), np.float64)
 
 
-def shared_prior(landmarks: Landmarks, both_sides: float = _ALIKE_ON_BOTH_SIDES) -> SharedPrior:
-    """Return the prior of shape, offsets and level."""
-    sigma, names = landmarks.body_sigma, landmarks.joints
-    group = landmarks.bone[:, None] == landmarks.bone
-    group &= group.sum(axis=1) > 2
-    share = np.where(group, _ALIKE_IN_A_GROUP, 0.0)
-    np.fill_diagonal(share, 1.0)
-    precision = np.eye(13 + 3 * len(sigma))
+def shared_prior(landmarks: Landmarks, *, between_bones: bool = True) -> SharedPrior:
+    """Return the prior of shape, offsets and level; landmarks of several bones vary together if wanted."""
+    modes = landmarks.modes.reshape(-1, landmarks.modes.shape[-1])
+    covariance = modes @ modes.T + np.diag(landmarks.body_sigma.ravel() ** 2)
+    if not between_bones:
+        bone = np.repeat(landmarks.bone, 3)
+        covariance *= bone[:, None] == bone
+    precision = np.eye(13 + len(modes))
     precision[:12, :12] = np.diag(SHAPE_SIGMA**-2)
-    mirror = np.array([[mirrored(one) == other != one for other in names] for one in names])
-    along = share + both_sides * np.where(group, 0.0, share @ mirror)
-    for axis, own in enumerate((share, share, along)):
-        precision[12 + axis : -1 : 3, 12 + axis : -1 : 3] = np.linalg.inv(own * np.outer(sigma, sigma))
-    return SharedPrior(np.concatenate([MEAN_SHAPE, np.zeros(3 * len(sigma) + 1)]), precision)
+    precision[12:-1, 12:-1] = np.linalg.inv(covariance)
+    return SharedPrior(np.concatenate([MEAN_SHAPE, np.zeros(len(modes) + 1)]), precision)
 
 
 @dataclass(frozen=True)
