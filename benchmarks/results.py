@@ -108,7 +108,7 @@ SECTIONS = (
         "Planner",
         "Flights are closed loops of point masses. Tilt is the elevation of cameras above the person."
         " Errors are those of joints that all arms measured. Differences: `adaptive` less the flight as"
-        " flown; by keypoints: the model with those of the films. Worlds up to 14 set the model's deviations.",
+        " flown; by keypoints: the model with those of the films. Worlds to 14 set the model's deviations.",
         (
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
             Part("planner-worlds", "Random worlds", MODELLED, ""),
