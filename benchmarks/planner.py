@@ -303,7 +303,7 @@ def films(options: argparse.Namespace) -> Lines:
         mean, apart = np.mean(rows[-1], axis=2)[::2, ::2], modelled["differences"][0]
         reach = np.ptp([apart["mpjpe_mm"]["interval"], apart["pck150"]["interval"]], axis=1) / [2, 0.02]
         held += np.abs(mean[0] - mean[1]) <= reach
-        told = [f"{model:.1f} ±{near:.1f}" for model, near in zip(mean[0], reach, strict=True)]
+        told = [f"{model:.1f}±{near:.1f}" for model, near in zip(mean[0], reach, strict=True)]
         table.append([str(seed), told[0], fixed(mean[1, 0], 1), told[1], fixed(mean[1, 1], 1)])
     header = [f"{of.replace('_', ' ')}, {figure}" for figure in FIGURES[::2] for of in KINDS[::2]]
     lines = [*markdown_table(["world", *header], table), ""]
