@@ -350,6 +350,14 @@ def test_one_drone_is_not_doubted(flight: Described, tmp_path: Path) -> None:
     assert json.loads(succeeds("check", mistaken(flight, alone), "--json"))["doubts"] == []
 
 
+def test_people_whom_no_two_cameras_see_are_named_by_no_cause(flight: Described) -> None:
+    right = sampled_of(mistaken(flight, None))
+    one, other = right.cameras[:2]
+    empty = [replace(each, pixels=np.full_like(each.pixels, np.nan)) for each in (one, other)]
+    assert [doubt.code for doubt in diagnose(right._replace(cameras=(one, empty[1])))] == ["residual"]
+    assert diagnose(right._replace(cameras=tuple(empty))) == []
+
+
 def test_a_gimbal_that_nobody_names_is_doubted_at_ingest(flight: Described, tmp_path: Path) -> None:
     def forgotten(manifest: dict[str, Any]) -> None:
         del manifest["cameras"]["drone1"]["gimbal"]

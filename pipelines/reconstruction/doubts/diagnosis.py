@@ -204,8 +204,8 @@ def diagnose(
 ) -> list[Doubt]:
     """Find what is odd about a flight, and why, that first that explains the most.
 
-    A flight of one camera, or whose cameras share no time, is not doubted here. A world on its side is named
-    where no usual convention turns it upright.
+    A flight of one camera, one without people, or whose cameras share no time, is not doubted here. A world
+    on its side is named where no usual convention turns it upright.
 
     Args:
         flight: the flight.
@@ -215,6 +215,8 @@ def diagnose(
     if flight is None or len(flight.cameras) < 2:
         return []
     trial = Trial(flight, scene_of(flight))
+    if not np.isfinite(trial.described.rays).any():
+        return []
     found = score(flight, trial.described)
     # A turned world leaves rays and bodies as they are; rolled cameras mirror the body.
     mirrored = any(found.odd[name].sigmas >= _STRANGE for name in ("face", "bend") if name in found.odd)
@@ -291,7 +293,8 @@ class Tried(NamedTuple):
         the rays alone must tell it; of times of one camera, they must fit as well, or tell it if nothing else
         does.
         """
-        by_score, by_rays = np.subtract(self.before, self.after)
+        with np.errstate(invalid="ignore"):  # infinite both, where no rays can be fitted
+            by_score, by_rays = np.subtract(self.before, self.after)
         if self.alternative.code in TIMES:
             is_scored = by_score >= _LEAST_GAIN_OF_TIMES
             least = -_ALIKE if is_scored and self.alternative.same_pictures is None else _MARGIN
@@ -366,8 +369,10 @@ class Objective:
 
         start = min(free.starts, key=misfit) if len(free.starts) > 1 else free.starts[0]
         found = fit(self.trial.flight, free.make, start, [_LOOSE] * len(start))
+        if not np.isfinite(found.cost):
+            return None  # too few joints are seen by two cameras
         alternative = free.alternative(found.numbers, found.covariance)
-        if alternative is None or not np.isfinite(found.cost):
+        if alternative is None:
             return None
         size, normal = alternatives.sizes(found.numbers), np.linalg.pinv(found.covariance)
         surer = float(np.linalg.slogdet(np.eye(len(size)) + size[:, None] * normal * size)[1])
