@@ -525,9 +525,8 @@ def test_film_has_no_keys_of_keypoints(flight: Described) -> None:
         for camera in sampled_of(mistaken(flight, None)).cameras
     ]
     assert remedies.mirrored(cameras[:1], "true").startswith("mirror the film of drone1 back")
-    lens = remedies.lines(
-        cameras[1:2], remedies.keypoints_size, 2.0
-    )  # calibrated in pictures of half the size
+    # Calibrated in pictures of half the size.
+    lens = remedies.lines(cameras[1:2], remedies.keypoints_size, 2.0)
     fx = float(lens.partition("fx: ")[2].partition(",")[0])
     assert lens.startswith("cameras.drone2.intrinsics: ")
     assert fx == pytest.approx(2 * cameras[1].intrinsics.fx, abs=0.1)

@@ -386,11 +386,8 @@ def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]
 
 # Score of a scene in which next to nothing is seen by two cameras.
 _IMPOSSIBLE = 99.0
-_CHI2_MEDIAN = {
-    1: 0.455,
-    3: 0.789,
-    5: 0.870,
-}  # median of chi^2 over its degrees of freedom, by those; else 0.9
+# Median of chi^2 over its degrees of freedom, by those; of more it is about 0.9.
+_CHI2_MEDIAN, _CHI2_MEDIAN_OF_MORE = {1: 0.455, 3: 0.789, 5: 0.870}, 0.9
 # A joint that is farther away does not tell how far stated errors move it.
 _FARTHEST_M = 30.0
 # Rays that cross by less than this sine tell no distance.
@@ -511,7 +508,8 @@ def _misfit(solved: SolvedJoints, good: Bool) -> float:
     total = 0.0
     for value in np.unique(freedom[good]):
         among = good & (freedom == value)
-        total += among.sum() * median(solved.chi2[among]) / value / _CHI2_MEDIAN.get(int(value), 0.9)
+        usual = _CHI2_MEDIAN.get(int(value), _CHI2_MEDIAN_OF_MORE)
+        total += among.sum() * median(solved.chi2[among]) / value / usual
     return float(np.sqrt(total / good.sum()))
 
 
