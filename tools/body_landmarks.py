@@ -66,7 +66,7 @@ CANDIDATES = {
 MODES = 6
 # Steps of the factor analysis: more change no digit that is written.
 _FACTOR_STEPS = 30
-# Share of a coordinate's standard deviation that is its own at least: thirty bodies show no closer ties.
+# Share of a coordinate's standard deviation that is its own at least: twenty bodies show no closer ties.
 _LEAST_OWN = 0.4
 
 
