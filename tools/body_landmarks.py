@@ -246,7 +246,9 @@ def factors(samples: Samples, joints: tuple[str, ...]) -> dict[str, Landmark]:
     other = [list(bones).index(mirrored(joint)) for joint in bones]
     count = len(set(bodies))
     covariance = np.zeros((3 * len(bones), 3 * len(bones)))
-    for rows in (away, away[:, other]):
+    # Sides are measured as on the left: in the mirrored person what has no side lies on the other.
+    across = np.array([[1.0, 1.0 if split(joint)[0] else -1.0, 1.0] for joint in bones])
+    for rows in (away, away[:, other] * across):
         flat = rows.reshape(len(rows), -1)
         covariance += flat.T @ (flat * weight[:, None]) / weight.sum() / 2 * (count + 1) / (count - 1)
     size = np.sqrt(np.diag(covariance))
@@ -280,13 +282,17 @@ def of_other_detectors(
     """Return a landmark of COCO or the feet, with BlazePose's modes and the distance between both tables."""
     side, part = split(joint)
     like = {"neck": "shoulder", "hip_middle": "hip", "small_toe": "big_toe"}.get(part, part)
-    seen = [
-        blazepose[name]
+    seen = {
+        name: blazepose[name]
         for name in ([f"{side}_{like}"] if side else [f"{each}_{like}" for each in SIDES])
         if name in blazepose
-    ] or [blazepose[like]]
-    own, within = np.mean([each.own**2 for each in seen], axis=0), seen[0].within
-    modes = np.mean([each.modes for each in seen], axis=0)
+    } or {like: blazepose[like]}
+    own = np.mean([each.own**2 for each in seen.values()], axis=0)
+    within = max(each.within for each in seen.values())
+    # What lies between both sides moves as their mean does; the right one is measured as on the left.
+    turned = [1.0 if side or split(name)[0] != "right" else -1.0 for name in seen]
+    across = np.array([[1.0, each, 1.0] for each in turned])[:, :, None]
+    modes = np.mean([each.modes for each in seen.values()] * across, axis=0)
     if part in soles:
         bone, offset = "foot", soles[part]
     elif (bone := best_bone(true, part)) is not None:
