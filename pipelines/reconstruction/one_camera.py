@@ -303,7 +303,7 @@ class StandingPoints(Points):
         super().__init__(body_model(), landmarks)
         self.ground = ground
         self.contacts = self.model.reach(*_contacts())  # [12, 34, 22, 3]
-        # Offsets that both sides share look like another distance here: with them bodies are 3 % worse.
+        # Offsets that several bones share look like another distance here: with them bodies are 3 % worse.
         prior = shared_prior(landmarks, between_bones=False)
         precision, mean = prior.precision, prior.mean
         mean[0] = stature_m[0]
