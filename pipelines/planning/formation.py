@@ -241,12 +241,8 @@ def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
 def _first_step(lattice: Lattice, start: Float) -> tuple[Bool, Float]:
     """Test which states [S] can follow slots anywhere between the states; return the time to each, too."""
     states = lattice.states.shape[0]
-    within, reach_s, way_s, nearest_s = (
-        np.zeros(states, np.bool_),
-        np.zeros(states),
-        np.zeros(states),
-        math.inf,
-    )
+    within, nearest_s = np.zeros(states, np.bool_), math.inf
+    reach_s, way_s = np.zeros(states), np.zeros(states)
     for s in range(states):
         for axis in range(3):
             way = abs(lattice.states[s, axis] - start[axis])

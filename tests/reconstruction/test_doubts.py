@@ -129,7 +129,6 @@ CASES: dict[str, tuple[str, Change]] = {
     "focal": ("intrinsics", of_cameras(focal(2.0))),
     "rolled": ("mount", of_mounts(turned("z", 180))),
     "mirrored": ("mirrored", with_keypoints(mirrored)),
-    "from below": ("mirrored", with_keypoints(from_below)),
     "gimbal": ("gimbal", fixed_gimbal(-DOWN_DEG, "world")),
     "clock": ("clock", of_cameras(clock(0.1), "drone3")),
     "heading": ("pose", of_poses(heading(8), "drone1")),
@@ -140,7 +139,7 @@ CASES: dict[str, tuple[str, Change]] = {
     "feet, one": ("unit", of_poses(lambda pose: (pose[0] / 0.3048, pose[1]), "drone1")),
 }
 WHOSE = {"clock": ["drone3"], "backwards": ["drone1"]}
-MENDED = ("videos", "rolled", "mirrored", "from below", "gimbal", "feet", "feet, one")
+MENDED = ("videos", "rolled", "mirrored", "gimbal", "feet", "feet, one")
 
 
 @pytest.mark.parametrize("case", sorted(set(CASES) - set(MENDED)))
@@ -452,8 +451,7 @@ def test_a_world_of_another_scale_is_named_with_its_scale(flight: Described, fac
     manifest = mistaken(flight, of_poses(lambda pose: (factor * pose[0], pose[1])))
     first = doubts_of(manifest)[0]
     assert first["code"] == "scale"
-    # 95 % of grown-ups are within 17 % of the usual stature.
-    # The map and the actor are right, so poses alone are scaled.
+    # 95 % of grown-ups are within 17 % of the usual stature. Map and actor are right: poses alone are scaled.
     scales = re.findall(r"pose\.world_from_source: {scale: ([0-9.]+)}", first["remedy"])
     assert np.array(scales, float) * factor == pytest.approx(np.ones(3), rel=0.17)
 
@@ -525,8 +523,7 @@ def test_film_has_no_keys_of_keypoints(flight: Described) -> None:
         for camera in sampled_of(mistaken(flight, None)).cameras
     ]
     assert remedies.mirrored(cameras[:1], "true").startswith("mirror the film of drone1 back")
-    # Calibrated in pictures of half the size.
-    lens = remedies.lines(cameras[1:2], remedies.keypoints_size, 2.0)
+    lens = remedies.lines(cameras[1:2], remedies.keypoints_size, 2.0)  # calibrated in half the size
     fx = float(lens.partition("fx: ")[2].partition(",")[0])
     assert lens.startswith("cameras.drone2.intrinsics: ")
     assert fx == pytest.approx(2 * cameras[1].intrinsics.fx, abs=0.1)

@@ -18,7 +18,7 @@ from pipelines.reconstruction.observations import Filmed
 from pipelines.session.description import PosesEntry
 
 Options = str | Callable[[PosesEntry], str]
-"""How poses are written, beside how they are read."""
+"""Keys of a pose that a remedy writes: a text, or a function of the stored entry that makes it."""
 
 # A mount is turned by nothing unless a mistake says so.
 _EYE = np.eye(3)
@@ -155,7 +155,7 @@ def keypoints_size(camera: Filmed, factor: float) -> str:
 
 
 MIRRORS = {"false": set[str](), "true": {"x", "names"}, "x": {"x"}, "y": {"y"}, "names": {"names"}}
-"""What of keypoints is mirrored, by the value of `keypoints.mirrored`."""
+"""Parts of keypoints that each value of `keypoints.mirrored` turns over: coordinates, or left and right."""
 
 
 def mirrored(cameras: Iterable[Filmed], value: str) -> str:
