@@ -135,3 +135,14 @@ def nearest_rows(ascending: Int64, values: Int64) -> Int64:
     before = np.maximum(after - 1, 0)
     is_after = ascending[after] - values < values - ascending[before]
     return np.where(is_after, after, before).astype(np.int64)
+
+
+def best_pairs(worth: Float | Int64) -> tuple[Int64, Int64]:
+    """Pair rows and columns [N, M] so that the sum of their worth is the largest: rows and columns."""
+    if worth.size and 1 in worth.shape:
+        best = int(worth.argmax())
+        return np.array([best // worth.shape[1]]), np.array([best % worth.shape[1]])
+    from scipy.optimize import linear_sum_assignment  # takes longer to load than all the rest
+
+    row, column = linear_sum_assignment(worth, maximize=True)
+    return row, column

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Index, Int64
+from pipelines.geometry.arrays import Bool, Float, Index, Int64, best_pairs
 
 Series = tuple[Float, Float]
 """Sums [T] and weights [T] of a figure at every moment or trial: the figure is the ratio of their totals."""
@@ -395,8 +395,6 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
     present, of joint times of true people. `by_person` has for each reconstructed person the times as a
     phantom, and the misses and switches of the true one who is theirs in IDF1 (None without one).
     """
-    from scipy.optimize import linear_sum_assignment
-
     known = np.isfinite(truth[..., 0]).any(axis=(1, 2))
     position, truth = position[known], truth[known]
     offset = position[:, :, None] - truth[:, None]
@@ -417,7 +415,7 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
         free[list(pairs.values())] = np.inf
         free[:, list(pairs)] = np.inf
         cost = np.where(free < np.inf, free, 1e6)
-        for p, q in np.transpose(linear_sum_assignment(cost)).tolist():
+        for p, q in np.transpose(best_pairs(-cost)).tolist():
             if free[p, q] < np.inf:
                 pairs[q] = p
                 switched[q] += last.get(q, p) != p
@@ -425,7 +423,7 @@ def tracking_errors(position: Float, truth: Float, *, within_m: float = 0.5) -> 
         missed[list(pairs)] -= 1
         phantom[list(pairs.values())] -= 1
     at = (distance < np.inf).sum(axis=0)
-    theirs = linear_sum_assignment(at, maximize=True)
+    theirs = best_pairs(at)
     same = int(at[theirs].sum())
     true_one = {p: q for p, q in np.transpose(theirs).tolist() if at[p, q]}
     misses, phantoms, switches = int(missed.sum()), int(phantom.sum()), int(switched.sum())
@@ -478,14 +476,11 @@ _MIN_SAMPLES, _MIN_TRIALS = 10, 2
 
 def matched(position: Float, others: Float) -> tuple[Index, Index]:
     """Match people of [T, P, J, 3] and [T, Q, J, 3], nearest on average and each once: rows of both."""
-    from scipy.optimize import linear_sum_assignment
-
     distance = _length(position[:, :, None] - others[:, None])
     shared = np.isfinite(distance)
     count = shared.sum(axis=(0, 3))
     total = np.where(shared, np.minimum(distance, _LARGEST_ERROR_M), 0.0).sum(axis=(0, 3))
-    own, match = linear_sum_assignment(np.where(count > 0, total / np.maximum(count, 1), _NEVER_TOGETHER_M))
-    return own, match
+    return best_pairs(-np.where(count > 0, total / np.maximum(count, 1), _NEVER_TOGETHER_M))
 
 
 def own_truth(position: Float, truth: Float) -> Float:

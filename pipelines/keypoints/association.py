@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
-from pipelines.geometry.arrays import Bool, Float, Int64, known_median
+from pipelines.geometry.arrays import Bool, Float, Int64, best_pairs, known_median
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.keypoints.bodies import (
     SAME_BODY_M,
@@ -358,7 +357,7 @@ def _by_logs(tracks: list[_BodyTrack], chains: list[_PersonTracks]) -> list[_Bod
     left = np.ones(len(tracks), bool)
     spent = np.zeros(len(tracks), bool)
     while (open_ := np.flatnonzero(left & ~spent & (likeness > 0).any(axis=1))).size:
-        row, person = linear_sum_assignment(np.maximum(likeness[open_], 0.0), maximize=True)
+        row, person = best_pairs(np.maximum(likeness[open_], 0.0))
         for k, p in zip(open_[row].tolist(), person.tolist(), strict=True):
             if likeness[k, p] > 0:
                 left[k] = not chains[p].offer(tracks[k])

@@ -17,9 +17,8 @@ than their standard deviations say, these are enlarged, and the bodies made agai
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from pipelines.geometry.arrays import Bool, Float, Int64, known_median
+from pipelines.geometry.arrays import Bool, Float, Int64, best_pairs, known_median
 
 # A pair of detections is one person within 3 sigma.
 _AGREE_CHI2 = 9.0
@@ -125,7 +124,7 @@ def find_bodies(
         shared = np.bincount(found[both] * known + track[rows][both], minlength=new * known)
         number = known + np.arange(new)
         if both.any():
-            own, other = linear_sum_assignment(shared.reshape(new, known), maximize=True)
+            own, other = best_pairs(shared.reshape(new, known))
             same = shared.reshape(new, known)[own, other] > 0
             number[own[same]] = other[same]
         fresh = (found >= 0) & (track[rows] < 0)
@@ -420,7 +419,7 @@ def _exchanged(evidence: Float, apart: Bool, nodes: _Nodes, body: Int64) -> Int6
                 over = moved[far] & ~moved[near]
                 ends = body[near[over]] * count + body[far[over]]
                 links = np.bincount(ends, value[over], count**2).reshape(count, count)
-                stays, leaves = linear_sum_assignment(links, maximize=True)
+                stays, leaves = best_pairs(links)
                 if links[stays, leaves].sum() <= np.trace(links) + 1e-6:
                     continue
                 to = np.empty(count, np.int64)

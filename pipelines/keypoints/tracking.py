@@ -8,7 +8,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.search import (
@@ -391,6 +390,8 @@ class PeopleTracker:
         regions = [track.person.region for track in self._seen()]
         if not logged or not regions:
             return list(logged)
+        from scipy.optimize import linear_sum_assignment
+
         apart_px = np.array(
             [
                 [

@@ -51,34 +51,35 @@ class PosePriorArrays(NamedTuple):
 
 @helper
 def _sighting(
-    place: Float, turned: Float, points: BackgroundPoints, n: int, ray: Float
-) -> tuple[Float, Float, Float, bool]:
-    """Compute derivatives by pose error [2, 6] and point [2, 3], the residual [2], and if it is in front."""
+    t: int, place: Float, turned: Float, points: BackgroundPoints, n: int, ray: Float, out: Float
+) -> tuple[float, float, bool]:
+    """Compute the residual, and if it is in front; fill derivatives [2, 9] by pose error and point."""
     origin, direction, across = points.origin[n], points.direction[n], points.across[n]
     inverse = points.inverse_depth[n]
-    by_pose, by_point, residual = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
-    seen, moved = np.zeros(3), np.zeros((3, 3))
-    for i in range(3):
-        for k in range(3):
-            base = origin[k] - place[k]
-            seen[i] += turned[k, i] * (direction[k] + inverse * base)
-            moved[i, 0] += turned[k, i] * across[0, k]
-            moved[i, 1] += turned[k, i] * across[1, k]
-            moved[i, 2] += turned[k, i] * base
-    x, y, z = seen[0], seen[1], seen[2]
+    x, y, z = 0.0, 0.0, 0.0
+    for k in range(3):
+        toward = direction[k] + inverse * (origin[k] - place[t, k])
+        x += turned[t, k, 0] * toward
+        y += turned[t, k, 1] * toward
+        z += turned[t, k, 2] * toward
     if z < _BEHIND:
-        return by_pose, by_point, residual, False
+        return 0.0, 0.0, False
     u, v = x / z, y / z
     for k in range(3):
-        by_point[0, k] = (moved[0, k] - u * moved[2, k]) / z
-        by_point[1, k] = (moved[1, k] - v * moved[2, k]) / z
-        by_pose[0, k] = inverse * (turned[k, 0] - u * turned[k, 2]) / z
-        by_pose[1, k] = inverse * (turned[k, 1] - v * turned[k, 2]) / z
+        a, b, c = 0.0, 0.0, 0.0
+        for i in range(3):
+            along = across[k, i] if k < 2 else origin[i] - place[t, i]
+            a += turned[t, i, 0] * along
+            b += turned[t, i, 1] * along
+            c += turned[t, i, 2] * along
+        out[0, 6 + k] = (a - u * c) / z
+        out[1, 6 + k] = (b - v * c) / z
+        out[0, k] = inverse * (turned[t, k, 0] - u * turned[t, k, 2]) / z
+        out[1, k] = inverse * (turned[t, k, 1] - v * turned[t, k, 2]) / z
     # A rotation error w turns the point in the camera by w x seen.
-    by_pose[0, 3], by_pose[0, 4], by_pose[0, 5] = -u * v, 1 + u * u, -v
-    by_pose[1, 3], by_pose[1, 4], by_pose[1, 5] = -1 - v * v, u * v, u
-    residual[0], residual[1] = ray[0] - u, ray[1] - v
-    return by_pose, by_point, residual, True
+    out[0, 3], out[0, 4], out[0, 5] = -u * v, 1 + u * u, -v
+    out[1, 3], out[1, 4], out[1, 5] = -1 - v * v, u * v, u
+    return ray[0] - u, ray[1] - v, True
 
 
 @helper
@@ -98,6 +99,7 @@ def _point_equations(
     turned: Float,
     loss: float,
     prior: Float,
+    by: Float,
     normal: Float,
     pull: Float,
 ) -> None:
@@ -108,16 +110,16 @@ def _point_equations(
     pull[2] = prior[1] * (prior[0] - points.inverse_depth[n])
     for s in range(seen.first[n], seen.first[n + 1]):
         t = seen.picture[s]
-        _, by_point, residual, front = _sighting(place[t], turned[t], points, n, seen.rays[s])
+        right, down, front = _sighting(t, place, turned, points, n, seen.rays[s], by)
         if not front:
             continue
-        missed = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
+        missed = (right**2 + down**2) / seen.sigma**2
         weight = 1 / (1 + missed / loss**2) / seen.sigma**2
         for i in range(3):
-            for a in range(2):
-                pull[i] += weight * by_point[a, i] * residual[a]
-                for k in range(3):
-                    normal[i, k] += weight * by_point[a, i] * by_point[a, k]
+            u, v = weight * by[0, 6 + i], weight * by[1, 6 + i]
+            pull[i] += u * right + v * down
+            for k in range(i + 1):
+                normal[i, k] += u * by[0, 6 + k] + v * by[1, 6 + k]
     _hold(normal)
     factorise(normal)
 
@@ -155,36 +157,16 @@ def eliminate_points(
     longest = 0
     for n in range(len(seen.first) - 1):
         longest = max(longest, seen.first[n + 1] - seen.first[n])
-    half = np.zeros((longest, 6, 3))
+    half = np.zeros((longest, 3, 6))
+    by, normal, pull = np.empty((2, 9)), np.empty((3, 3)), np.empty(3)
     for n in range(len(seen.first) - 1):
         start, stop = seen.first[n], seen.first[n + 1]
-        normal, pull = np.zeros((3, 3)), np.zeros(3)
         for _ in range(settle):
-            _point_equations(n, seen, points, place, turned, loss, prior, normal, pull)
+            _point_equations(n, seen, points, place, turned, loss, prior, by, normal, pull)
             forward(normal, pull)
             backward(normal, pull)
             _move(points, n, pull)
-        _point_equations(n, seen, points, place, turned, loss, prior, normal, pull)
-        for s in range(start, stop):
-            t = seen.picture[s]
-            mixed = half[s - start]
-            mixed[:] = 0.0
-            by_pose, by_point, residual, front = _sighting(place[t], turned[t], points, n, seen.rays[s])
-            if not front:
-                missed[s] = math.nan
-                continue
-            square = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
-            missed[s] = math.sqrt(square)
-            weight = 1 / (1 + square / loss**2) / seen.sigma**2
-            at = offset[t]
-            for a in range(2):
-                for i in range(6):
-                    share = weight * by_pose[a, i]
-                    force[at + i] += share * residual[a]
-                    for k in range(3):
-                        mixed[i, k] += share * by_point[a, k]
-                    for k in range(i + 1):
-                        band[at + k, i - k] += share * by_pose[a, k]
+        _point_equations(n, seen, points, place, turned, loss, prior, by, normal, pull)
         # Whitened: mixed F^-T, and F^-1 pull.
         forward(normal, pull)
         for i in range(3):
@@ -192,11 +174,27 @@ def eliminate_points(
             for k in range(3):
                 kept[n, 3 * i + k] = normal[i, k]
         for s in range(start, stop):
-            mixed = half[s - start]
-            at = offset[seen.picture[s]]
+            t, mixed = seen.picture[s], half[s - start]
+            right, down, front = _sighting(t, place, turned, points, n, seen.rays[s], by)
+            if not front:
+                mixed[:] = 0.0
+                missed[s] = math.nan
+                continue
+            square = (right**2 + down**2) / seen.sigma**2
+            missed[s] = math.sqrt(square)
+            weight = 1 / (1 + square / loss**2) / seen.sigma**2
+            at = offset[t]
             for i in range(6):
-                forward(normal, mixed[i])
-                force[at + i] -= mixed[i, 0] * pull[0] + mixed[i, 1] * pull[1] + mixed[i, 2] * pull[2]
+                u, v = weight * by[0, i], weight * by[1, i]
+                for k in range(3):
+                    mixed[k, i] = u * by[0, 6 + k] + v * by[1, 6 + k]
+                    for m in range(k):
+                        mixed[k, i] -= normal[k, m] * mixed[m, i]
+                    mixed[k, i] /= normal[k, k]
+                force[at + i] += u * right + v * down
+                force[at + i] -= mixed[0, i] * pull[0] + mixed[1, i] * pull[1] + mixed[2, i] * pull[2]
+                for k in range(i + 1):
+                    band[at + k, i - k] += u * by[0, k] + v * by[1, k]
         for s in range(start, stop):
             later = half[s - start]
             after = offset[seen.picture[s]]
@@ -205,10 +203,10 @@ def eliminate_points(
                 before = offset[seen.picture[r]]
                 away = after - before
                 for k in range(6):
-                    e0, e1, e2 = earlier[k, 0], earlier[k, 1], earlier[k, 2]
+                    e0, e1, e2 = earlier[0, k], earlier[1, k], earlier[2, k]
                     for i in range(k if away == 0 else 0, 6):
                         band[before + k, away + i - k] -= (
-                            later[i, 0] * e0 + later[i, 1] * e1 + later[i, 2] * e2
+                            later[0, i] * e0 + later[1, i] * e1 + later[2, i] * e2
                         )
 
 
@@ -224,22 +222,21 @@ def move_points(
     step: Float,
 ) -> None:
     """Move the points by what the step [n] of the poses leaves to them; `kept` is of `eliminate_points`."""
-    factor = np.zeros((3, 3))
+    by, factor, force = np.empty((2, 9)), np.zeros((3, 3)), np.empty(3)
     for n in range(len(seen.first) - 1):
-        force = np.zeros(3)
+        force[:] = 0.0
         for s in range(seen.first[n], seen.first[n + 1]):
             t = seen.picture[s]
-            by_pose, by_point, residual, front = _sighting(place[t], turned[t], points, n, seen.rays[s])
+            right, down, front = _sighting(t, place, turned, points, n, seen.rays[s], by)
             if not front:
                 continue
-            square = (residual[0] ** 2 + residual[1] ** 2) / seen.sigma**2
-            weight = 1 / (1 + square / loss**2) / seen.sigma**2
+            weight = 1 / (1 + (right**2 + down**2) / seen.sigma**2 / loss**2) / seen.sigma**2
             for a in range(2):
                 along = 0.0
                 for i in range(6):
-                    along += by_pose[a, i] * step[offset[t] + i]
+                    along += by[a, i] * step[offset[t] + i]
                 for i in range(3):
-                    force[i] -= weight * by_point[a, i] * along
+                    force[i] -= weight * by[a, 6 + i] * along
         for i in range(3):
             for k in range(3):
                 factor[i, k] = kept[n, 3 * i + k]
