@@ -312,10 +312,10 @@ def _block_diagonal(rotation: Float) -> Float:
 
 def cross_matrix(vector: Float) -> Float:
     """Build the matrix [..., 3, 3] whose product with a vector u is the cross product v x u."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    o = np.zeros_like(x)
-    rows = [[o, -z, y], [z, o, -x], [-y, x, o]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    matrix = np.zeros((*vector.shape, 3))
+    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrix[..., c, b], matrix[..., b, c] = vector[..., a], -vector[..., a]
+    return matrix
 
 
 def _propagated(jacobian: Float, covariance: Float) -> Float:

@@ -714,9 +714,14 @@ def add_bones(
     front: Float,
     gradient: Float,
 ) -> None:
-    """Add the prior of the bones at one time around their lengths, in units of the body's size."""
-    shrinking = 1.0 / lengths.sum() if len(lengths) else 0.0
-    direction, by_length = np.empty(3), np.empty(len(lengths))
+    """Add the prior of the bones at one time around their lengths, in units of the body's size.
+
+    A length changes the residual of its bone, and by the body's size those of all bones alike.
+    """
+    n, B = 3 * len(position), len(lengths)
+    shrinking = 1.0 / lengths.sum() if B else 0.0
+    direction, together, own = np.empty(3), np.zeros(n), np.zeros(B)
+    cost = 0.0
     for b in range(len(bones)):
         i, j = bones[b]
         length = 0.0
@@ -728,26 +733,28 @@ def add_bones(
             continue
         weight = 1 / (sigma[b] * grown) ** 2
         residual = length - lengths[b]
-        for axis in range(3):
-            direction[axis] /= length
-        low, high = offset + 3 * min(i, j), offset + 3 * max(i, j)
+        own[b] = weight * residual
+        cost += weight * residual**2
+        front[length_offset + b, length_offset + b] += weight
+        low, high = 3 * min(i, j), 3 * max(i, j)
         sign = 1.0 if j > i else -1.0  # of the joint with the larger number
-        by_length[:] = -residual * shrinking
-        by_length[b] -= 1.0
-        for d in range(len(lengths)):
-            gradient[length_offset + d] += weight * residual * by_length[d]
-            for e in range(d + 1):
-                front[length_offset + d, length_offset + e] += weight * by_length[d] * by_length[e]
-            for p in range(3):
-                product = sign * weight * direction[p] * by_length[d]
-                front[length_offset + d, high + p] += product
-                front[length_offset + d, low + p] -= product
         for p in range(3):
-            gradient[high + p] += sign * weight * residual * direction[p]
-            gradient[low + p] -= sign * weight * residual * direction[p]
+            along = sign * direction[p] / length
+            front[length_offset + b, offset + high + p] -= weight * along
+            front[length_offset + b, offset + low + p] += weight * along
+            together[high + p] += own[b] * along
+            together[low + p] -= own[b] * along
             for q in range(3):
-                product = weight * direction[p] * direction[q]
-                front[high + p, low + q] -= product
+                product = weight * direction[p] * direction[q] / length**2
+                front[offset + high + p, offset + low + q] -= product
                 if q <= p:
-                    front[high + p, high + q] += product
-                    front[low + p, low + q] += product
+                    front[offset + high + p, offset + high + q] += product
+                    front[offset + low + p, offset + low + q] += product
+    for p in range(n):
+        gradient[offset + p] += together[p]
+    for d in range(B):
+        gradient[length_offset + d] -= own[d] + cost * shrinking
+        for p in range(n):
+            front[length_offset + d, offset + p] -= shrinking * together[p]
+        for e in range(d + 1):
+            front[length_offset + d, length_offset + e] += shrinking * (own[d] + own[e] + cost * shrinking)
