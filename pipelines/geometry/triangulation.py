@@ -22,15 +22,16 @@ pose noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations, islice, pairwise
 from itertools import count as count_up
 from math import comb, cos, gcd, radians
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int8, Int64
 
@@ -123,12 +124,28 @@ def triangulate(
     `low_parallax`: no two lines differ by `MIN_PARALLAX_DEG`; `rejected`: fewer views agree within `gate`
     (`robust`), or the point is behind a camera (`dlt`, `midpoint`, which reject no view).
     """
-    poses = _poses_of(views)
-    blocks = []
-    for first in range(0, max(len(views.weight), 1), _BLOCK):
-        part = slice(first, first + _BLOCK)
-        blocks.append(_triangulate_block(_rows(views, part), poses, method, gate, with_covariance))
-    return Triangulation(*(np.concatenate(results) for results in zip(*blocks, strict=True)))
+    poses, count = _poses_of(views), len(views.weight)
+    return _joined(
+        (
+            _triangulate_block(
+                _rows(views, slice(first, first + _BLOCK)), poses, method, gate, with_covariance
+            )
+            for first in range(0, max(count, 1), _BLOCK)
+        ),
+        count,
+    )
+
+
+def _joined(parts: Iterable[Sequence[NDArray[Any]]], count: int) -> Triangulation:
+    """Join the fields of parts of `count` points as they come, so that they are not in memory twice."""
+    whole: list[NDArray[Any]] = []
+    begin = 0
+    for part in parts:
+        whole = whole or [np.empty((count, *each.shape[1:]), each.dtype) for each in part]
+        for all_rows, each in zip(whole, part, strict=True):
+            all_rows[begin : begin + len(each)] = each
+        begin += len(part[0])
+    return Triangulation(*whole)
 
 
 class _Poses(NamedTuple):
@@ -427,12 +444,11 @@ def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) ->
     """
     if len(picture) > _ROWS_AT_ONCE:
         cuts = np.searchsorted(picture, picture[_ROWS_AT_ONCE::_ROWS_AT_ONCE]).tolist()
-        parts = [
+        parts = (
             triangulate_pictures(_rows(views, part), picture=picture[part], pixel_sigma=pixel_sigma)
             for part in (slice(*ends) for ends in pairwise([0, *cuts, len(picture)]))
-        ]
-        names = [field.name for field in fields(Triangulation)]
-        return Triangulation(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
+        )
+        return _joined((tuple(vars(part).values()) for part in parts), len(picture))
     first = triangulate(views, method="robust")
     gross = _gross(views, picture, first.points, pixel_sigma)
     if not gross.any():

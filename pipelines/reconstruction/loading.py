@@ -34,8 +34,10 @@ from pipelines.session.tables import (
     POSES,
     TRUTH,
     detections_from,
+    join_detections,
     most_confident,
     read_motion,
+    read_parts,
     read_table,
     trajectory_from,
 )
@@ -121,18 +123,18 @@ def _load_camera(
     trajectory = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
     mended = Mended(trajectory, None, 0, 0, 0, 0.0) if entry.poses.static else mend(trajectory)
     warnings += warnings_of_stretches(name, mended)
-    keypoints = read_table(source.table, KEYPOINTS)
-    if (keypoints["frame"] > frames["frame"].max()).any():
-        raise DataError(
-            source.table, "holds keypoints of frames that are not there", "run it again with --force"
-        )
-    keypoints = keypoints[keypoints["confidence"] >= min_confidence]
-    if calibrated is not None and entry.keypoints is None:
-        raw, joint = keypoints["confidence"].to_numpy(np.float64), keypoints["joint"].to_numpy(str)
-        keypoints = keypoints.assign(confidence=calibrated(raw, joint))
-    detections = detections_from(keypoints, joints)
-    del keypoints
-    detections, crowd = most_confident(detections, _MOST_PEOPLE)
+    parts = []
+    for keypoints in read_parts(source.table, KEYPOINTS):
+        if (keypoints["frame"] > frames["frame"].max()).any():
+            raise DataError(
+                source.table, "holds keypoints of frames that are not there", "run it again with --force"
+            )
+        used = keypoints[keypoints["confidence"] >= min_confidence]
+        if calibrated is not None and entry.keypoints is None:
+            raw, joint = used["confidence"].to_numpy(np.float64), used["joint"].to_numpy(str)
+            used = used.assign(confidence=calibrated(raw, joint))
+        parts.append(detections_from(used, joints))
+    detections, crowd = most_confident(join_detections(parts), _MOST_PEOPLE)
     if crowd:
         warnings.append(f"{name}: {crowd} detections left out, more than {_MOST_PEOPLE} in a picture")
     frame, every = frames["frame"].to_numpy(np.int64), source.looked_at.step or 1

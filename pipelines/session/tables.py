@@ -370,6 +370,22 @@ def detections_from(table: pd.DataFrame, joints: tuple[str, ...]) -> Detections:
     )
 
 
+def join_detections(parts: Sequence[Detections]) -> Detections:
+    """Join detections of the same joints; one person of a frame may be in several parts."""
+    keys = np.concatenate([np.stack([part.frame, part.person], axis=1) for part in parts])
+    people, row = np.unique(keys, axis=0, return_inverse=True)
+    joints = parts[0].joints
+    xy = np.full((len(people), len(joints), 2), np.nan)
+    confidence = np.zeros((len(people), len(joints)))
+    begin = 0
+    for part in parts:
+        own, joint = np.nonzero(~np.isnan(part.xy[..., 0]))
+        at = row[begin + own]
+        xy[at, joint], confidence[at, joint] = part.xy[own, joint], part.confidence[own, joint]
+        begin += len(part.frame)
+    return Detections(joints, people[:, 0], people[:, 1], xy, confidence, np.unique(people[:, 0]))
+
+
 def most_confident(detections: Detections, most: int) -> tuple[Detections, int]:
     """Keep the `most` most confident people of each frame; return also the number left out."""
     frame = detections.frame
