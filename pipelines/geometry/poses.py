@@ -24,12 +24,15 @@ ENU_FROM_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 def matrix_from_quaternion(quaternion_xyzw: Float) -> Float:
     """Convert unit quaternions [..., 4] to rotation matrices [..., 3, 3]."""
     x, y, z, w = np.moveaxis(quaternion_xyzw, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    matrix = np.empty((*x.shape, 9))
+    entries = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    for k, entry in enumerate(entries):
+        matrix[..., k] = entry
+    return matrix.reshape(*x.shape, 3, 3)
 
 
 def quaternion_from_matrix(matrix: Float) -> Float:

@@ -47,7 +47,7 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
         stated = FORMATS.get(name)
         if isinstance(stated, protocols):
             if path.is_file() and not stated.recognises(path):
-                others = [f.title for f in FORMATS.all() if isinstance(f, protocols) and f.recognises(path)]
+                others = [f.title for f in FORMATS.all(protocols) if f.recognises(path)]
                 if others:
                     problem = f"is no {stated.title} but {' or '.join(others)}"
                     raise DataError(path, problem, "leave `format:` out", code="wrong-kind")
@@ -58,7 +58,7 @@ def recognise_any(path: Path, protocols: tuple[type, ...], noun: str, *, name: s
         raise DataError(path, "does not exist", remedy, code="no-such-file")
     refuse_special(path)
     refuse_pointers(path)
-    candidates = [f for f in FORMATS.all() if isinstance(f, protocols)]
+    candidates = FORMATS.all(protocols)
     matches = [f for f in candidates if f.recognises(path)]
     if len(matches) == 1:
         return matches[0]

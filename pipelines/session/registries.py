@@ -311,9 +311,17 @@ class Registry(Generic[T]):
         loaded: T = self._entries[name].load()
         return loaded
 
-    def all(self) -> list[T]:
-        """Load every registered object, in the order of their names."""
-        return [self.get(name) for name in self.names()]
+    @cached_property
+    def _kinds(self) -> dict[tuple[type, ...], list[T]]:
+        return {}
+
+    def all(self, kinds: tuple[type, ...] = (object,)) -> list[T]:
+        """Load every registered object of some kinds, in the order of their names."""
+        if kinds not in self._kinds:  # a protocol looks at each of an object's attributes
+            self._kinds[kinds] = [
+                self.get(name) for name in self.names() if isinstance(self.get(name), kinds)
+            ]
+        return self._kinds[kinds]
 
 
 FORMATS: Registry[Format] = Registry("mocap.formats", "format")
