@@ -2,10 +2,11 @@
 
 Key pictures are chosen by time. Points are followed from each to the next ones through all pictures of a
 film; pictures that are too far apart in time for that are matched by SIFT features. COLMAP's global mapper
-(Pan et al. 2024) maps them. The map depends on the pictures and the lens alone, so it is kept while places,
-clocks and noise change. A similarity lays it on the logged places, roughly. One bundle adjustment then has
-the sightings, the places with errors that are correlated in time, and a level horizon as evidence. Its
-covariance is that of the attitudes.
+(Pan et al. 2024) maps them. Over flat ground some of its maps contradict their own sightings: those begin
+anew on a plane. The map depends on the pictures and the lens alone, so it
+is kept while places, clocks and noise change. A similarity lays it on the logged places, roughly. One
+bundle adjustment then has the sightings, the places with errors that are correlated in time, and a level
+horizon as evidence. Its covariance is that of the attitudes.
 
 Each camera is mapped by itself: views of two drones that are 90 degrees apart share too little, and a joint
 map of the sample flight was wrong by 6 m. Where no log has places, people whom several cameras see join
@@ -44,7 +45,7 @@ from pipelines.reconstruction.body_fit import landmarks_of
 from pipelines.reconstruction.solving import MIN_MOMENTS, away_by_size
 
 # Another number of features, pairs or key pictures gives other maps: kept maps of an older one are not used.
-REVISION = 5
+REVISION = 6
 
 # --- which pictures, and what is matched -----------------------------------------------------------------
 
@@ -96,8 +97,15 @@ FAR_PX = 2.0
 # Of right maps at most 10 % of the sightings are far, of wrong ones 26 % and more (20 rendered cameras).
 MAX_FAR_SHARE = 0.16
 # The same share before places adjust a map, which they never do where no log has any. Of 23 right maps of
-# rendered flights 22 have 0.096 or less and one has 0.108; of seven wrong ones the least has 0.114.
+# rendered flights 22 have 0.096 or less and one has 0.108; of seven wrong ones the least has 0.114. Begun on
+# a plane, the six wrong ones that were tried have 0.03 to 0.07 and miss true places by 6 to 23 mm.
 FAR_SHARE_TO_MAP_AGAIN = 0.1
+# Pictures this many steps from the middle one say how the plane lies below it.
+PLANE_STEPS = (-12, -8, -5, -3, 3, 5, 8, 12)
+# Points on a plane that are further away, in heights of the camera above it, are seen too flatly to place.
+MAX_PLANE_DISTANCE = 30.0
+# Larger errors above a plane are those of points beside it, and a chain of poses with this mean is none.
+MAX_PLANE_ERROR_PX = 30.0
 # Loss of sightings in the rounds of the adjustment, px: the map's bend first, the points' errors last.
 LOSS_ROUNDS_PX = (30.0, 6.0, 2.0)
 # Followed points drift together with their neighbours, and keep their error for a second. So many sightings
@@ -289,13 +297,12 @@ def map_pictures(
 ) -> PictureMap:
     """Map key pictures by their features, refining a guessed focal length; NoAttitudesError: too few.
 
-    A map of the global mapper that its own sightings contradict is made again by the incremental one, from
-    more pairs, and the better one counts.
+    A map of a film that its own sightings contradict begins anew on a plane, and the better one counts.
     """
     found = _mapped(features, intrinsics, refine_focal=refine_focal)
-    if far_share(found, intrinsics) > FAR_SHARE_TO_MAP_AGAIN:
+    if len(features[0].point) and far_share(found, intrinsics) > FAR_SHARE_TO_MAP_AGAIN:
         with suppress(NoAttitudesError):
-            again = _mapped(features, intrinsics, refine_focal=refine_focal, one_by_one=True)
+            again = _mapped_above_plane(features, intrinsics)
             found = min(found, again, key=partial(far_share, intrinsics=intrinsics))
     return found
 
@@ -319,44 +326,27 @@ def _shrunk_focal_px(found: PictureMap, intrinsics: Intrinsics) -> float:
     return float(focal_px) * shrinkage(intrinsics.width, intrinsics.height)
 
 
-def _mapped(
-    features: Sequence[KeyFeatures],
-    intrinsics: Intrinsics,
-    *,
-    refine_focal: bool,
-    one_by_one: bool = False,
-) -> PictureMap:
-    """Map by COLMAP: all pictures at once, or one by one from pairs of neighbours, too."""
+def _mapped(features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool) -> PictureMap:
+    """Map by COLMAP, all pictures at once."""
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     focal_px = (intrinsics.fx * intrinsics.fy) ** 0.5
     with TemporaryDirectory() as folder:
         place = Path(folder)
-        least = 1 if one_by_one else MIN_PAIR_STEPS
-        matched = _matched_pairs(place / "features.db", features, intrinsics, focal_px, least)
+        matched = _matched_pairs(place / "features.db", features, intrinsics, focal_px)
         if matched < MIN_MAPPED_PICTURES:
             raise NoAttitudesError(
                 f"only {matched} pairs of its {len(features)} key pictures have {MIN_MATCHES} matches:"
                 " they are dark, blurred or without texture"
             )
         (place / "maps").mkdir()
-        where = place / "features.db", place, place / "maps"
-        if one_by_one:
-            several = pycolmap.IncrementalPipelineOptions(
-                num_threads=1,
-                random_seed=SEED,
-                ba_refine_focal_length=refine_focal,
-                ba_refine_extra_params=False,
-            )
-            found = pycolmap.incremental_mapping(*where, options=several)
-        else:
-            options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=SEED)
-            options.mapper.num_threads = 1
-            adjusting = options.mapper.bundle_adjustment
-            adjusting.ceres.solver_options.num_threads = 1
-            adjusting.refine_focal_length, adjusting.refine_extra_params = refine_focal, False
-            found = pycolmap.global_mapping(*where, options=options)
+        options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=SEED)
+        options.mapper.num_threads = 1
+        adjusting = options.mapper.bundle_adjustment
+        adjusting.ceres.solver_options.num_threads = 1
+        adjusting.refine_focal_length, adjusting.refine_extra_params = refine_focal, False
+        found = pycolmap.global_mapping(place / "features.db", place, place / "maps", options=options)
     model = max(found.values(), key=lambda each: each.num_reg_images(), default=None)
     mapped = 0 if model is None else model.num_reg_images()
     if model is None or mapped < max(MIN_MAPPED_PICTURES, MIN_MAPPED_SHARE * len(features)):
@@ -401,23 +391,104 @@ def _read_model(model: Any, features: Sequence[KeyFeatures], focal_px: float) ->
                 poses[number] = found["cam_from_world"]
     key = sorted(poses)
     placed = [poses[number].inverse() for number in key]
+    at = np.array([pose.translation for pose in placed])
+    turned = np.array([pose.rotation.quat for pose in placed])
+    return _with_sightings(key, at, turned, names, features, float(camera.params[0] / focal_px))
+
+
+def _with_sightings(
+    key: Sequence[int], at: Float, turned: Float, names: Any, features: Sequence[KeyFeatures], ratio: float
+) -> PictureMap:
+    """Return a map of pictures with their points that are seen often; `names` has one for each, or -1."""
     often = (
         np.bincount(np.concatenate([names[number][names[number] >= 0] for number in key])) >= MIN_SIGHTINGS
     )
     seen = [(names[number] >= 0) & often[names[number]] for number in key]
-    ratio = float(camera.params[0] / focal_px)
+    points = np.concatenate([names[number][each] for number, each in zip(key, seen, strict=True)])
     return PictureMap(
         np.array(key, np.int64),
-        np.array([pose.translation for pose in placed]),
-        continuous_signs(np.array([pose.rotation.quat for pose in placed])),
+        at,
+        continuous_signs(turned),
         np.repeat(np.arange(len(key)), [int(each.sum()) for each in seen]),
-        np.unique(
-            np.concatenate([names[number][each] for number, each in zip(key, seen, strict=True)]),
-            return_inverse=True,
-        )[1],
+        np.unique(points, return_inverse=True)[1],
         np.concatenate([features[number].xy[each] for number, each in zip(key, seen, strict=True)]) / ratio,
         ratio,
     )
+
+
+def _mapped_above_plane(features: Sequence[KeyFeatures], intrinsics: Intrinsics) -> PictureMap:
+    """Map a film by homographies from one plane, then adjust; NoAttitudesError: there is no such plane.
+
+    Two views of a plane leave two normals (Longuet-Higgins 1986); all others decide between them.
+    """
+    focal_px = float(intrinsics.fx * intrinsics.fy) ** 0.5 * shrinkage(intrinsics.width, intrinsics.height)
+    middle, normals = len(features) // 2, []
+    for other in middle + np.array(PLANE_STEPS):
+        if 0 <= other < len(features):
+            shared = features[middle].point, features[other].point
+            _, mine, its = np.intersect1d(*shared, return_indices=True)
+            rays = np.insert(features[middle].xy[mine], 2, 1.0, axis=1)
+            moved = _homography(rays[:, :2], features[other].xy[its], focal_px)
+            if moved is not None:
+                both = np.array(cv2.decomposeHomographyMat(moved, np.eye(3))[3])[..., 0]
+                normals += [normal for normal in both if np.median(rays @ normal) > 0]
+    chains = [_chain_above_plane(features, normal, focal_px) for normal in normals]
+    chains.sort(key=lambda chain: chain[2])
+    if not chains or chains[0][2] >= MAX_PLANE_ERROR_PX:
+        raise NoAttitudesError("its pictures show no plane")
+    at, turn, _ = chains[0]
+    names, every = [each.point for each in features], range(len(features))
+    found = _with_sightings(every, at, quaternion_from_matrix(turn), names, features, 1.0)
+    # The poses of the chain hold scale and place, loosely.
+    bundle = _Bundle(found, focal_px, np.eye(len(at)), at, np.eye(len(at)) / found.size**2)
+    fit = _adjusted(Similarity(1.0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)), bundle)
+    return replace(found, position=fit.position, quaternion_xyzw=continuous_signs(fit.quaternion_xyzw))
+
+
+def _homography(source: Float, target: Float, focal_px: float) -> Float | None:
+    """Fit a homography to points [N, 2] on a plane and x/z and y/z [N, 2]; None: it is not determined."""
+    if len(source) < MIN_MATCHES:
+        return None
+    found = cv2.findHomography(source, target, cv2.RANSAC, FAR_PX / focal_px)[0]
+    return None if found is None else np.asarray(found, np.float64)
+
+
+def _chain_above_plane(
+    features: Sequence[KeyFeatures], normal: Float, focal_px: float
+) -> tuple[Float, Float, float]:
+    """Place pictures one by one, from the middle one at (0, 0, 1), above the plane z = 0.
+
+    `normal` [3] points from it to the plane, in its camera. Return places [K, 3], world_from_camera
+    [K, 3, 3] and the mean error of points as if all were on the plane, px; infinite if the chain breaks.
+    """
+    count, middle = len(features), len(features) // 2
+    right = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    right /= np.linalg.norm(right)
+    at, turn, errors = np.tile([0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3, 3)), [np.zeros(0)]
+    turn[middle] = right, np.cross(-normal, right), -normal
+    placed = np.full((1 + max(int(each.point.max(initial=0)) for each in features), 2), np.nan)
+    for k in (middle, *range(middle + 1, count), *range(middle - 1, -1, -1)):
+        own = features[k]
+        known = np.isfinite(placed[own.point, 0])
+        if k != middle:
+            there = placed[own.point[known]]
+            view = _homography(there, own.xy[known], focal_px)
+            if view is None:
+                return at, turn, np.inf
+            view *= np.sign(np.median(there @ view[2, :2] + view[2, 2]))
+            view /= np.sqrt(np.linalg.norm(view[:, 0]) * np.linalg.norm(view[:, 1]))
+            u, _, vt = np.linalg.svd(np.column_stack([view[:, :2], np.cross(view[:, 0], view[:, 1])]))
+            turn[k] = (u @ vt).T
+            at[k] = -turn[k] @ view[:, 2]
+            if at[k, 2] <= 0:
+                return at, turn, np.inf
+            seen = (np.insert(there, 2, 0.0, axis=1) - at[k]) @ turn[k]
+            errors.append(focal_px * np.linalg.norm(seen[:, :2] / seen[:, 2:] - own.xy[known], axis=1))
+        ray = np.insert(own.xy, 2, 1.0, axis=1) @ turn[k].T
+        away = np.linalg.norm(ray, axis=1) / np.maximum(-ray[:, 2], 0.5 / MAX_PLANE_DISTANCE)
+        new = ~known & (away < MAX_PLANE_DISTANCE)
+        placed[own.point[new]] = (at[k] - at[k, 2] * ray[new] / ray[new, 2:])[:, :2]
+    return at, turn, float(np.minimum(np.concatenate(errors), MAX_PLANE_ERROR_PX).mean())
 
 
 def _determines_focal(model: Any) -> bool:
@@ -441,7 +512,7 @@ def _determines_focal(model: Any) -> bool:
 
 
 def _matched_pairs(
-    path: Path, features: Sequence[KeyFeatures], intrinsics: Intrinsics, focal_px: float, least_steps: int
+    path: Path, features: Sequence[KeyFeatures], intrinsics: Intrinsics, focal_px: float
 ) -> int:
     """Write features and matches as a database of pycolmap; return the number of pairs that match."""
     import pycolmap
@@ -477,7 +548,7 @@ def _matched_pairs(
             database.write_descriptors(image.image_id, described)
         ids.append(image.image_id)
     for first, second in combinations(range(len(features)) if film else (), 2):
-        if second - first >= least_steps:
+        if second - first >= MIN_PAIR_STEPS:
             points = features[first].point, features[second].point
             matches = np.stack(np.intersect1d(*points, return_indices=True)[1:], axis=1)
             if len(matches) >= MIN_MATCHES:
