@@ -4,10 +4,9 @@ The points that were followed through the films of the corpus are mapped once fo
 same calls as `mocap ingest` with `pose.attitude: pictures`. The camera's true places are then disturbed many
 times, as two kinds of logs (`LOGS`) would.
 
-`off` is the root mean square angle, over draws and key pictures, between found and true attitudes. `bound` is
-that of an unbiased estimate that is told the exact shape of the path and all attitudes beside each other
-(Cramér and Rao, of a similarity on the same places with a horizon level to 2 deg): no map of one camera gets
-below it. `NEES` is the mean squared common error by its covariance: 3 where the standard deviation is right.
+`off` is the root mean square angle, over draws and key pictures, from the truth. `bound` is that of an
+unbiased estimate that knows the path's shape and how attitudes differ (Cramér and Rao, of a similarity on the
+same places and a horizon level to 2 deg). `NEES` is the mean squared common error by its covariance.
 
 `--joined` takes the places away, too (`pose: pictures`, stature stated). `off` is then that of the cameras'
 mean attitudes after one similarity; joints are compared in true axes, with their own scale.
@@ -19,7 +18,7 @@ import argparse
 import json
 import re
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +29,7 @@ import pandas as pd
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
 from benchmarks.corpus.stored import flights, read_backgrounds, read_keypoints
 from benchmarks.results import markdown_table, parser_of, show
-from pipelines.geometry.arrays import Float, Int64, Intrinsics
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import Bias, GaussMarkov, NoiseModel, White, disturb, pose_errors
 from pipelines.geometry.poses import (
     conjugate,
@@ -57,8 +56,7 @@ from pipelines.reconstruction.picture_map import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
-from pipelines.session.records import Detections, Trajectory
-from pipelines.session.storage import read_json
+from pipelines.session.records import Detections
 from pipelines.simulation.flight import SimulatedDrone
 from pipelines.simulation.flight_files import write_tum
 from pipelines.sources.attitudes import FilmOfCamera, UnposedCamera, posed_by_people
@@ -72,7 +70,6 @@ LOGS: dict[str, tuple[list[NoiseModel], float]] = {
     "gps": ([GaussMarkov(position_m=1.5, correlation_s=100)], 1.0),
 }
 """Errors of places, and the time between two of them, s."""
-
 JOINED_FLIGHTS = "07-jog", "23-jog-and-crouch", "02-jog", "08-walk", "16-two-people"
 """Flights of three drones that move; the first two were tuned on."""
 
@@ -92,9 +89,8 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
         yield "joined", markdown_table(columns, [joined(name) for name in options.flights or JOINED_FLIGHTS])
         return
     names = options.flights or (KEPT if options.kept else TUNED)
-    heading = ["flight", "camera", "moves m"]
-    for log in LOGS:
-        heading += [f"{log} refused", f"{log} off deg", "bound", "NEES"]
+    each = [text for log in LOGS for text in (f"{log}: off (bound) deg", "NEES")]
+    heading = ["flight", "camera", "moves m", "refused", *each]
     rows = [row for name in names for row in measured(name, options.draws)]
     yield "attitudes-kept" if options.kept else "attitudes-tuned", markdown_table(heading, rows)
 
@@ -106,52 +102,41 @@ def measured(name: str, draws: int) -> Iterator[list[str]]:
     with TemporaryDirectory() as folder:
         drones = DrawnFlight(flight, Path(folder)).simulated.drones
     for drone in drones:
-        true, lens = drone.at_frames, drone.intrinsics
-        own = Trajectory(true.t_ns, true.camera_position, true.camera_quaternion_xyzw)
-        t_ns = own.t_ns
-        keys = key_rows(t_ns)
-        row = [name, drone.name, f"{np.linalg.norm(own.position[-1] - own.position[0]):.1f}"]
+        path = drone.at_frames.camera_position
+        row = [name, drone.name, f"{np.linalg.norm(path[-1] - path[0]):.1f}"]
         try:
             found = _map_of(drone, backgrounds[drone.name].tracks)
         except NoAttitudesError:
-            yield [*row, "not mapped", *7 * ["-"]]
+            yield [*row, "not mapped", *4 * ["-"]]
             continue
-        for log in LOGS.values():
-            row += _figures(found, lens, t_ns[keys], own, log, draws)
-        yield row
+        figures = [_figures(found, drone, *log, draws) for log in LOGS.values()]
+        row.append(f"{sum(refused for refused, *_ in figures)}/{len(figures) * draws}")
+        yield row + [text for _, *texts in figures for text in texts]
 
 
 def _figures(
-    found: PictureMap,
-    lens: Intrinsics,
-    key_t_ns: Int64,
-    own: Trajectory,
-    log: tuple[list[NoiseModel], float],
-    draws: int,
-) -> list[str]:
-    """Lay a map on places with errors drawn anew; return refusals, errors, their bound and NEES."""
-    (models, step_s), t_ns, position, turned = log, own.t_ns, own.position, own.quaternion_xyzw
-    wide = {"max_gap_ns": 10**9, "max_extrapolation_ns": 10**9}
-    true = interpolate_poses(t_ns, position, turned, key_t_ns[found.key], **wide)[1]
+    found: PictureMap, drone: SimulatedDrone, models: list[NoiseModel], step_s: float, draws: int
+) -> tuple[int, str, str]:
+    """Lay a map on places with errors drawn anew; return refusals, errors with their bound, and NEES."""
+    t_ns, position = drone.at_frames.t_ns, drone.at_frames.camera_position
+    own = t_ns, position, drone.at_frames.camera_quaternion_xyzw
+    key_t_ns = t_ns[key_rows(t_ns)]
+    at_ns, errors = key_t_ns[found.key], pose_errors(models)
+    true = interpolate_poses(*own, at_ns, max_gap_ns=10**9, max_extrapolation_ns=10**9)[1]
     step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)
-    off, nees, refused = [], [], 0
+    off, nees = [], []
     for draw in range(draws):
-        places, _ = disturb(models, t_ns, position, turned, np.random.default_rng([3, draw]))
-        try:
-            laid = lay_on_places(found, lens, key_t_ns, t_ns[::step], places[::step], pose_errors(models))
-        except NoAttitudesError:
-            refused += 1
-            continue
-        apart = rotation_vector_from_quaternion(multiply(laid.quaternion_xyzw, conjugate(true)))
-        off.append(np.square(apart).sum(axis=1).mean())
-        nees.append(np.square(apart.mean(axis=0)).sum() / laid.common_sigma_rad**2)
-    rows = np.flatnonzero((t_ns >= key_t_ns[found.key[0]]) & (t_ns <= key_t_ns[found.key[-1]]))
-    rows = rows[rows % step == 0]
-    covariance = position_covariance(pose_errors(models), t_ns[rows] / 1e9)
-    bound = f"{np.degrees(_bound_rad(position[rows], matrix_from_quaternion(true), covariance)):.2f}"
-    if not off:
-        return [f"{refused}/{draws}", "-", bound, "-"]
-    return [f"{refused}/{draws}", f"{np.degrees(np.sqrt(np.mean(off))):.2f}", bound, f"{np.mean(nees):.1f}"]
+        places = disturb(models, *own, np.random.default_rng([3, draw]))[0]
+        with suppress(NoAttitudesError):
+            laid = lay_on_places(found, drone.intrinsics, key_t_ns, t_ns[::step], places[::step], errors)
+            apart = rotation_vector_from_quaternion(multiply(laid.quaternion_xyzw, conjugate(true)))
+            off.append(np.square(apart).sum(axis=1).mean())
+            nees.append(np.square(apart.mean(axis=0)).sum() / laid.common_sigma_rad**2)
+    rows = np.flatnonzero((t_ns >= at_ns[0]) & (t_ns <= at_ns[-1]) & (np.arange(len(t_ns)) % step == 0))
+    covariance = position_covariance(errors, t_ns[rows] / 1e9)
+    bound = np.degrees(_bound_rad(position[rows], matrix_from_quaternion(true), covariance))
+    shown = f"{np.degrees(np.sqrt(np.mean(off))):.2f}" if off else "-"
+    return draws - len(off), f"{shown} ({bound:.2f})", f"{np.mean(nees):.1f}" if off else "-"
 
 
 def _bound_rad(places: Float, turn: Float, covariance: Float) -> float:
@@ -175,22 +160,19 @@ def joined(name: str) -> list[str]:
         cameras = {}
         for drone in drawn.simulated.drones:
             t_ns, nothing = drone.at_frames.t_ns, FilmOfCamera("", nullcontext)  # type: ignore[arg-type]
-            frames, map_of = CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), backgrounds[drone.name].tracks
-            people, lens = _detections(kept.tables[drone.name]), drone.intrinsics
-            own = nothing, frames, lens, people, False, partial(_map_of, drone, map_of)
-            cameras[drone.name] = UnposedCamera(*own)
+            frames, people = CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), kept.tables[drone.name]
+            own, map_of = drone.intrinsics, partial(_map_of, drone, backgrounds[drone.name].tracks)
+            cameras[drone.name] = UnposedCamera(nothing, frames, own, _detections(people), False, map_of)
         try:
             posed = posed_by_people(name, cameras, float(stature_m), lambda _: None, Silent())
         except DataError as error:
             return [name, f"refused: {error.code}", *3 * ["-"]]
-        tracks = {drone: each.trajectory for drone, each in posed.items()}
-        true = {}
+        tracks, true = {drone: each.trajectory for drone, each in posed.items()}, {}
         for drone in drawn.simulated.drones:
             at, rows = drone.at_frames, np.searchsorted(drone.at_frames.t_ns, tracks[drone.name].t_ns)
             true[drone.name] = at.camera_position[rows], at.camera_quaternion_xyzw[rows]
-        places = [np.concatenate([tracks[drone].position for drone in tracks])]
-        places += [np.concatenate([true[drone][0] for drone in tracks])]
-        to_true = first_similarity(*places)[0]
+        places = [(tracks[drone].position, true[drone][0]) for drone in tracks]
+        to_true = first_similarity(*(np.concatenate(each) for each in zip(*places, strict=True)))[0]
         drawn.write_shared()
         sessions = [drawn.session(Path(folder) / "logged", 0, "model", "blazepose")]
         session = drawn.session(Path(folder) / "true", 0, "model", "blazepose", poses="true")
@@ -206,19 +188,15 @@ def joined(name: str) -> list[str]:
             nees.append(off[-1] ** 2 / float(noise["bias"]["rotation_deg"]) ** 2)
             place, t_ns = to_true.places(track.position) / to_true.scale, track.t_ns
             write_tum(manifest.with_name(f"{camera}.tum"), t_ns + flight.scenario.start_ns, place, now)
-            stated = re.compile(rf"pose: {{file: truth/{camera}\.tum}}(\n    pose_noise: .*)?")
-            text = stated.sub(f"pose: {camera}.tum\n    pose_noise: {json.dumps(noise)}", text)
+            stated = rf"pose: {{file: truth/{camera}\.tum}}(\n    pose_noise: .*)?"
+            text = re.sub(stated, f"pose: {camera}.tum\n    pose_noise: {json.dumps(noise)}", text)
         manifest.write_text(text, encoding="utf-8")
         sessions.append(ingest(manifest, manifest.with_name("posed")).folder)
+        with kept_in_place_of_pictures(flight, "blazepose"):
+            done = [reconstruct(each, ReconstructSettings(people=1)).metrics for each in sessions]
+        errors = ", ".join(f"{metrics['root_mpjpe_mm']:.0f}" for metrics in done)
         row = [name, f"{np.sqrt(np.square(off).mean()):.2f}", f"{np.mean(nees):.1f}"]
-        row += [f"{100 / to_true.scale - 100:+.1f}"]
-        errors = []
-        for session in sessions:
-            with kept_in_place_of_pictures(flight, "blazepose"):
-                reconstruct(session, ReconstructSettings(people=1))
-            metrics = read_json(session / "reconstruct" / "metrics.json")
-            errors.append(f"{metrics['root_mpjpe_mm']:.0f}")
-        return [*row, ", ".join(errors)]
+        return [*row, f"{100 / to_true.scale - 100:+.1f}", errors]
 
 
 def _detections(table: pd.DataFrame) -> Detections:
@@ -240,6 +218,5 @@ def _map_of(drone: SimulatedDrone, seen: pd.DataFrame, _: str = "") -> PictureMa
 if __name__ == "__main__":
     parser = parser_of(__doc__)
     add_arguments(parser)
-    asked = parser.parse_args()
-    for key, lines in run(asked):
+    for key, lines in run(asked := parser.parse_args()):
         show(key, lines, write=asked.write)

@@ -70,7 +70,8 @@ SECTIONS = (
     Section(
         "Real pictures",
         "Pose2Sim's demo: one person, four still cameras. Virtual gimbals crop and turn the videos along"
-        " known paths; errors of logged attitudes are drawn. The reference is `robust` from still cameras.",
+        " known paths; attitude errors are drawn. The reference is `robust` from still cameras. Bounds are"
+        " those of exact paths.",
         (
             Part("gimbals-kept", "Cameras that turn", REAL, KEPT),
             Part("gimbals-tuned", "Cameras that turn", REAL, TUNED),

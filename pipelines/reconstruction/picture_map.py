@@ -98,7 +98,7 @@ FAR_PX = 2.0
 MAX_FAR_SHARE = 0.16
 # The same share before places adjust a map, which they never do where no log has any. Of 23 right maps of
 # rendered flights 22 have 0.096 or less and one has 0.108; of seven wrong ones the least has 0.114. Begun on
-# a plane, the six wrong ones that were tried have 0.03 to 0.07 and miss true places by 6 to 23 mm.
+# a plane, the five that were tried have 0.03 to 0.07 and miss true places by 6 to 23 mm.
 FAR_SHARE_TO_MAP_AGAIN = 0.1
 # Pictures this many steps from the middle one say how the plane lies below it.
 PLANE_STEPS = (-12, -8, -5, -3, 3, 5, 8, 12)
