@@ -40,7 +40,7 @@ from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.description import Doubt
 from pipelines.session.errors import DataError
 from pipelines.session.stages import locked
-from pipelines.session.tables import POSES, read_table, trajectory_from
+from pipelines.session.tables import read_poses
 from tests.synthetic.described_flights import (
     FLIGHTS,
     KEPT_ASIDE,
@@ -130,7 +130,7 @@ def off_sigmas(own: Described, session: Path, evidence: dict[str, Any]) -> list[
     """Return how far stated poses are from the true ones, in the standard deviations of a remedy."""
     off = []
     for name, (_, right) in own.cameras.items():
-        track = trajectory_from(read_table(session / "cameras" / name / "poses.parquet", POSES))
+        track = read_poses(session / "cameras" / name / "poses.parquet")
         moved, turned = compose(invert(*right), (track.position, track.quaternion_xyzw))
         apart = (moved, np.degrees(rotation_vector_from_quaternion(turned)))
         off.append([float(np.median(np.linalg.norm(each, axis=1))) for each in apart])

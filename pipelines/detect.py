@@ -41,13 +41,12 @@ from pipelines.session.storage import hash_of, read_json, write_json
 from pipelines.session.tables import (
     FRAMES,
     KEYPOINTS,
-    POSES,
     TRACKS,
     join_tables,
     keypoints_table,
+    read_poses,
     read_table,
     rows_between,
-    trajectory_from,
     write_table,
 )
 from pipelines.sources.pictures import CameraPictures, open_pictures, refuse_changed_pictures
@@ -260,7 +259,7 @@ def _hints_at(
     people = logged_people(folder, description)[: 1 if only_one else None]
     if not people:
         return [()] * len(t_ns)
-    track = trajectory_from(read_table(folder / "cameras" / camera / "poses.parquet", POSES))
+    track = read_poses(folder / "cameras" / camera / "poses.parquet")
     entry, between = description.cameras[camera], description.pose_interpolation
     of_each = [actor_hints(each, camera, entry, track, between, t_ns) for each in people]
     return list(zip(*of_each, strict=True))

@@ -46,11 +46,11 @@ from pipelines.session.tables import (
     ANGLES,
     FRAMES,
     GAIT,
-    POSES,
     REPLAN,
     SKELETON,
     load_bodies,
     read_motion,
+    read_poses,
     read_table,
     trajectory_from,
 )
@@ -176,10 +176,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
     record = session.intact_record("reconstruct")
     table = folder / "reconstruct" / "skeleton.parquet"
     motion = None if record is None else read_motion(table, SKELETON)
-    cameras = {
-        name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
-        for name in description.cameras
-    }
+    cameras = {name: read_poses(folder / "cameras" / name / "poses.parquet") for name in description.cameras}
     recording = Recording(
         description.flight,
         motion,

@@ -51,15 +51,14 @@ from pipelines.session.tables import (
     BODY_SHAPE,
     CAMERA_POSES,
     PLAN,
-    POSES,
     TRUTH,
     actor_table,
     join_tables,
     motion_table,
     pose_table,
     read_parts,
+    read_poses,
     read_table,
-    trajectory_from,
     write_table,
 )
 from pipelines.session.urls import as_urls, located, media_path, named
@@ -189,7 +188,7 @@ def ingest(
                 warnings.append(OF_ONE_CAMERA)
 
             tables = {name: run.folder / "cameras" / name / "poses.parquet" for name in entries}
-            tracks = {name: trajectory_from(read_table(path, POSES)) for name, path in tables.items()}
+            tracks = {name: read_poses(path) for name, path in tables.items()}
             units = {name: camera.pose.unit for name, camera in flight.cameras.items()}
             if of_unit := doubt_of_unit(tracks, units):
                 doubts = [of_unit]  # every other place follows from it

@@ -218,19 +218,25 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
     # x(t) - x(t-1) - r (x(t-1) - x(t-2)) of positions of equal noise.
     variance = 1.0 + (1.0 + ratio) ** 2 + ratio**2
     sides = np.stack([left, right], axis=1)  # [R, side, K, 2]
-    error = np.full((len(t_s), 2, 2, 2, 2, left.shape[1]), np.nan)  # [R, before last, last, now, side, K]
-    for states in np.ndindex(2, 2, 2):
+
+    def errors(states: Sequence[int]) -> Float:
+        found = np.full((len(t_s), 2, left.shape[1]), np.nan)  # [R, side, K]
         for side in (0, 1):
             oldest, old, now = (sides[i : len(sides) - 2 + i, side ^ state] for i, state in enumerate(states))
             jump = now - old - ratio[:, None, None] * (old - oldest)
-            error[(slice(2, None), *states, side)] = (jump**2).sum(-1) / variance[:, None]
-    error[~predicted] = np.nan
-    usual = error[:, 0, 0, 0]
+            found[2:, side] = (jump**2).sum(-1) / variance[:, None]
+        found[~predicted] = np.nan
+        return found
+
+    usual = errors((0, 0, 0))
     usual = usual[np.isfinite(usual)]
     # The median of a chi-squared of two degrees of freedom is 2 ln 2.
     noise2 = max(float(np.median(usual)) / (2 * np.log(2)) if usual.size else 0.0, least_noise**2)
-    squares = _TAIL_VARIANCES * np.log1p(error / (_TAIL_VARIANCES * max(noise2, np.finfo(float).tiny)))
-    return np.nansum(squares, axis=-2), linked, float(np.sqrt(noise2))
+    tail = _TAIL_VARIANCES * max(noise2, np.finfo(float).tiny)
+    cost = np.empty((len(t_s), 2, 2, 2, left.shape[1]))  # [R, before last, last, now, K]
+    for states in np.ndindex(2, 2, 2):
+        cost[(slice(None), *states)] = np.nansum(_TAIL_VARIANCES * np.log1p(errors(states) / tail), axis=1)
+    return cost, linked, float(np.sqrt(noise2))
 
 
 @cached

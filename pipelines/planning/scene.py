@@ -40,10 +40,10 @@ from pipelines.session.stages import StageRecord
 from pipelines.session.tables import (
     CAMERA_POSES,
     PLAN,
-    POSES,
     SKELETON,
     TRUTH,
     read_motion,
+    read_poses,
     read_table,
     trajectory_from,
 )
@@ -387,7 +387,7 @@ def _cameras(
     true_poses = _true_poses(folder, description)
     cameras, stating = [], set()
     for name, entry in description.cameras.items():
-        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+        logged = read_poses(folder / "cameras" / name / "poses.parquet")
         noise, stated_by = _noise(name, entry, logged, pose_noise)
         stating.add(stated_by)
         cameras.append(

@@ -31,15 +31,14 @@ from pipelines.session.stages import StageRecord
 from pipelines.session.tables import (
     FRAMES,
     KEYPOINTS,
-    POSES,
     TRUTH,
     detections_from,
     join_detections,
     most_confident,
     read_motion,
     read_parts,
+    read_poses,
     read_table,
-    trajectory_from,
 )
 
 # More people in one picture are errors of the detector, and memory grows with their number.
@@ -120,7 +119,7 @@ def _load_camera(
 ) -> Camera:
     entry = description.cameras[name]
     frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES).iloc[source.looked_at]
-    trajectory = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+    trajectory = read_poses(folder / "cameras" / name / "poses.parquet")
     mended = Mended(trajectory, None, 0, 0, 0, 0.0) if entry.poses.static else mend(trajectory)
     warnings += warnings_of_stretches(name, mended)
     parts = []

@@ -331,6 +331,14 @@ def trajectory_from(table: pd.DataFrame) -> Trajectory:
     )
 
 
+def read_poses(path: Path) -> Trajectory:
+    """Read the trajectory that `pose_table` stored part by part; DataError: missing, or damaged."""
+    parts = [trajectory_from(part) for part in read_parts(path, POSES)]
+    known = {name for name, value in vars(parts[0]).items() if isinstance(value, np.ndarray)}
+    joined: dict[str, Any] = {n: np.concatenate([getattr(part, n) for part in parts]) for n in sorted(known)}
+    return replace(parts[0], **joined)
+
+
 def keypoints_table(detections: Detections, known_frame: Int64, t_ns: Int64) -> pd.DataFrame:
     """Make rows of `tables.KEYPOINTS` from the joints that were found, in known frames [F] with times [F]."""
     import pandas as pd

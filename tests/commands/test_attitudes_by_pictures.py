@@ -20,7 +20,7 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 from pipelines.session.storage import read_json
-from pipelines.session.tables import POSES, read_table, trajectory_from
+from pipelines.session.tables import read_poses
 from pipelines.session.yaml_files import plain_yaml
 from tests.commands.runner import mocap, succeeds
 
@@ -54,7 +54,7 @@ def save(stated: dict[str, Any], manifest: Path) -> None:
 
 def attitude_error_deg(session: Path, folder: Path, camera: str) -> float:
     """Return the RMS angle between the attitudes of pictures in a session and the truth, deg."""
-    poses = trajectory_from(read_table(session / "cameras" / camera / "poses.parquet", POSES))
+    poses = read_poses(session / "cameras" / camera / "poses.parquet")
     true = TUM.read_trajectory(folder / "truth" / f"{camera}.tum")
     there = interpolate_poses(
         true.t_ns,
