@@ -241,6 +241,7 @@ def reconstruct(
             workers=workers,
             executor=executor,
         )
+        flight.waiting.release()
         progress.advance()
         attempts = (
             reconstruct_once(
@@ -254,11 +255,13 @@ def reconstruct(
         )
         stored = next(attempts)
         doubts = _doubts(flight, stored)
+        flight.waiting.release()
         _raise_if_nothing_was_measured(folder, stored, doubts)
         gait, walks = gait_of(stored.observations, stored.result)
         bodies = stored.bodies
         if bodies is None:
             bodies = fit_bodies(stored.observations, stored.views, stored.result)
+        flight.waiting.release()
         metrics = stored.metrics | {
             "gait": walks,
             "body": body_figures(stored.observations.t_ns, stored.metrics["people"]["names"], bodies, folder),
@@ -581,6 +584,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         cameras, background["ground"] = binding.cameras, binding.entry
     if made is None or cameras is not logged:
         made = _triangulated(flight, cameras)
+    flight.waiting.release()
     seen, views, solve = made.seen, made.views, made.solve
     observations = seen.observations
     progress.advance()

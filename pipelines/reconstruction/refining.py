@@ -162,6 +162,8 @@ def doubted_people(
     not doubted ("residual" if views disagree too much). `doubts` are causes that are known. If everybody is
     doubted, nobody is.
     """
+    if len(doubts) == 1:
+        return [""]
     shape = observations.confidence.shape
     away = result.points[:, None] - views.position[views.pose_index]
     x, y, depth = np.einsum("ncij,nci->jnc", views.rotation[views.pose_index], away)

@@ -250,7 +250,8 @@ class Waiting:
         return copy
 
     def release(self) -> None:
-        """Give back the memory of all arrays; who looks at them again reads the file."""
+        """Give back the memory of all arrays, and what is unused; who looks at them again reads the file."""
+        return_unused()
         if hasattr(mmap, "MADV_DONTNEED"):
             for mapped in self._maps:
                 mapped.madvise(mmap.MADV_DONTNEED)
