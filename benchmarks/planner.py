@@ -22,6 +22,7 @@ import csv
 import json
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -286,7 +287,7 @@ def films(options: argparse.Namespace) -> Lines:
     """Compare `adaptive` with the flight as flown, as modelled and as filmed."""
     rows: list[list[Float]] = []
     table: list[list[str]] = []
-    held, left_out = np.zeros(2, int), 0
+    held, left_out = np.zeros(2, int), Counter[str]()
     for seed in count(options.first or 0):
         if len(rows) == (options.count or 10):
             break
@@ -295,21 +296,25 @@ def films(options: argparse.Namespace) -> Lines:
             session = ingest(manifest, manifest.parent / "one.session").folder
             modelled = replan(session, settings_of(stated, arms=("adaptive", "flown"), trials=100)).metrics
             if any(any(arm["limit_violations"].values()) for arm in modelled["arms"].values()):
-                left_out += 1  # as in verdicts
+                left_out["broken limits"] += 1  # as in verdicts
                 continue
             film(session, FilmSettings())
             errors = [dict(np.load(session / "film" / name / "errors.npz")) for name in modelled["arms"]]
-        rows.append([differences(*(arm[of] for arm in errors)) for of in KINDS])
-        mean, apart = np.mean(rows[-1], axis=2)[::2, ::2], modelled["differences"][0]
+        apart, found = modelled["differences"][0], [differences(*(arm[of] for arm in errors)) for of in KINDS]
+        if apart["mpjpe_mm"] is None or not np.isfinite(found).all():
+            left_out["no common joint"] += 1
+            continue
+        rows.append(found)
+        mean = np.mean(found, axis=2)[::2, ::2]
         reach = np.ptp([apart["mpjpe_mm"]["interval"], apart["pck150"]["interval"]], axis=1) / [2, 0.02]
         held += np.abs(mean[0] - mean[1]) <= reach
         told = [f"{model:.1f}±{near:.1f}" for model, near in zip(mean[0], reach, strict=True)]
         table.append([str(seed), told[0], fixed(mean[1, 0], 1), told[1], fixed(mean[1, 1], 1)])
     header = [f"{of.replace('_', ' ')}, {figure}" for figure in FIGURES[::2] for of in KINDS[::2]]
     lines = [*markdown_table(["world", *header], table), ""]
-    lines += [
-        f"Of {len(rows)} intervals (95 %), {held[0]} (mm) and {held[1]} (points) hold; {left_out} left out."
-    ]
+    reasons = ", ".join(f"{number} for {reason}" for reason, number in left_out.items()) or "none"
+    hold = f"{held[0]} (mm) and {held[1]} (points) hold"
+    lines += [f"Of {len(rows)} intervals (95 %), {hold}; left out: {reasons}."]
     return [*lines, "", *(calibration(np.array(rows)) if len(rows) > 2 else [])]
 
 

@@ -7,7 +7,8 @@ here, but for those of `refined`, which were measured once on another machine.
     association    five people among each other in five cameras, 450 frames
     refinement     75 s of five cameras, 17 joints, 30 Hz
     logs           a recorder's log of 200 MB: rosbags iterates over raw messages, we ingest
-    planner        a central plan of the seed's size and of the largest; 75 s of flight; a map of 25 M voxels
+    planner        a central plan of the seed's size and of the largest; 75 s of flight, and two arms compared
+                   with 1 and 100 trials; a map of 25 M voxels
     renderer       a picture of the sample's scene, 1280x720
     sample         the commands on the sample flight, with detection in all pictures
 """
@@ -29,19 +30,24 @@ import numpy as np
 import pycolmap
 import yaml  # type: ignore[import-untyped]
 
-from benchmarks.flights import SAMPLE
+from benchmarks.flights import SAMPLE, scenario_of
+from benchmarks.flights import walker as person
+from benchmarks.planner import simulated
 from benchmarks.results import markdown_table, parser_of, show
 from benchmarks.scale import cost_of
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import pose_errors
 from pipelines.geometry.triangulation import Views, estimate_noise, triangulate
+from pipelines.ingest import ingest
 from pipelines.planning.arms import ADAPTIVE, FIXED, JOINT
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import distance_field
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import formation_slots
 from pipelines.planning.replay import Start, replay
+from pipelines.planning.scene import ReplanSettings
 from pipelines.reconstruction.refinement.refine import refine
+from pipelines.replan import replan
 from pipelines.session.records import Occupancy
 from pipelines.simulate import simulate
 from tests.geometry.rings import FOCAL, ring, with_outliers, with_pixel_noise
@@ -220,9 +226,24 @@ def planner() -> Iterator[Row]:
             fly = partial(replay, arm, *walker(seconds), [field], Start(2, np.pi / 4), config=PlannerConfig())
             took_s = best_s(fly, 2)
         yield f"75 s of flight by {arm.name}", f"{took_s:.2f} s", ""
+    yield from _trials()
     with get_context("spawn").Pool(1) as pool:
         took_s, peak_gb = pool.apply(_field_of_hills)
     yield "distance field of 25 M voxels", f"{took_s:.1f} s, {peak_gb:.2f} GB", ""
+
+
+def _trials() -> Iterator[Row]:
+    """Time `mocap replan-compare` of two arms on 75 s past a mound, with few and usual draws of noise."""
+    way = {"walk": {"distance_m": 85, "speed_mps": 1.2, "turn_deg": 60}}
+    plan = scenario_of({"one": person(-40, 0, 0, way)}, seed=1)
+    plan["world"] |= {"mounds": [{"centre": [0, 6], "sigma_m": [4, 2], "height_m": 5}]}
+    plan |= {"duration_s": 75, "drones": plan["drones"] | {"count": 2}}
+    with simulated(plan) as manifest:
+        session = ingest(manifest, manifest.parent / "one.session").folder
+        for trials in (1, 100):
+            stated = ReplanSettings(arms=("fixed", "adaptive"), trials=trials)
+            took_s = best_s(partial(replan, session, stated, force=True), 2)  # the first compiles
+            yield f"two arms over 75 s, trials: {trials}", f"{took_s:.1f} s", ""
 
 
 def _field_of_hills() -> tuple[float, float]:

@@ -21,8 +21,19 @@ from pipelines.detect import TIME_BETWEEN_STILLS_S
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Bool, Float, Int64, Picture
+from pipelines.geometry.cameras import project
 from pipelines.geometry.noise import NoiseModel, pose_errors
 from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.geometry.triangulation import PIXEL_SIGMA_PX, Views
+from pipelines.keypoints.association import associate
+from pipelines.keypoints.bodies import SightLines
+from pipelines.keypoints.corrections import (
+    Calibration,
+    measured_for,
+    read_calibration,
+    swaps_across_views,
+    undo_swaps_of_tracks,
+)
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
 from pipelines.keypoints.tracking import FollowedPeople
 from pipelines.planning.comparison import common_frames, figures_of, filmed_verdict, judge, verdict
@@ -41,8 +52,9 @@ from pipelines.reconstruction.background_tracks import (
     people_boxes,
 )
 from pipelines.reconstruction.ground import bind_positions
-from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.observations import Camera, Observations, candidates, observe, on_sides
 from pipelines.reconstruction.refining import refined_points
+from pipelines.reconstruction.solving import ray_sigma
 from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -58,6 +70,7 @@ from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.walks import (
+    MIN_CONFIDENCE,
     CameraFormation,
     SimulatedKeypoints,
     Walk,
@@ -65,7 +78,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=17)
+FILM = Stage("film", revision=18)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -151,6 +164,8 @@ def film(
         path = scenario or _scenario_of(folder, description)
         detector = find_detector(settings.detector)
         detector.load(threads=1)  # raises an error at once if a file is missing
+        confidences = measured_for(settings.detector)
+        calibration = read_calibration(confidences) if confidences else None
         plan = read_scenario(path)
         inputs = {"replan": compared.key, "scenario": hash_of(plan.identity())}
         if hashes := {name: sha256_of(file) for name, (file, _) in plan.motion_files(path.parent).items()}:
@@ -190,17 +205,20 @@ def film(
             ]
             sightings = _read_sightings(parts)
             seed = compared.settings["seed"]  # one draw of the comparison's pose noise
-            cameras = [_corrected(arm, sightings, parts, seed=seed, draw=draw) for draw in range(DRAWS)]
-            measured = [
-                _measured(arm, of, seen, cameras, seed=seed)
-                for of, seen in zip(arm.people, sightings, strict=True)
+            found = _detections(arm, sightings, calibration)
+            cameras = [
+                _corrected(arm, sightings, found, parts, seed=seed, draw=draw) for draw in range(DRAWS)
             ]
+            observed = [_observed(arm, own) for own in cameras]
+            measured = [_measured(arm, p, seen, cameras, observed) for p, seen in enumerate(sightings)]
             points = np.stack([own for own, _, _ in measured], axis=1)
             errors[name] = joined([of_draws for _, of_draws, _ in measured])
             joints, usual = arm.people[0].person.joints, filmed_errors(settings.detector)
             by_model = partial(detect_by_model, joints=joints, errors=usual, rate_hz=settings.rate_hz)
             modelled[name] = _modelled(arm, fields, [by_model] * len(arm.people), seed=seed)
-            as_filmed = [partial(_detect_as_filmed, arm, seen) for seen in sightings]
+            as_filmed = [
+                partial(_detect_as_filmed, arm, p, cameras[0], observed[0]) for p in range(len(arm.people))
+            ]
             by_keypoints = _modelled(arm, fields, as_filmed, seed=seed).error_m
             each = [own for _, _, own in measured]
             by_person = dict(zip((who.name for who in setting.people), each, strict=True))
@@ -316,9 +334,8 @@ def _arm(
         motion, person = performer.moving((moments - plan.start_ns) / 1e9), performer.person
         joints = person.keypoints(motion)
         people.append(Walk(moments, person, performer.look.body.height_m, motion, joints, motion.root))
-    seen_by = CameraFormation(
-        position.take(rows, axis=1), quaternion.take(rows, axis=1), flight.cameras[0].intrinsics
-    )
+    lens = replace(flight.cameras[0].intrinsics, readout_s=0.0)  # each picture is of one moment
+    seen_by = CameraFormation(position.take(rows, axis=1), quaternion.take(rows, axis=1), lens)
     tilt = table["tilt_rad"].to_numpy(np.float64).reshape(-1, len(cameras)).T
     hips = [person.hips_at(moments) for person in logged]
     return _Arm(
@@ -422,21 +439,39 @@ def _read_sightings(parts: Sequence[Path]) -> list[SimulatedKeypoints]:
     return [SimulatedKeypoints(found[:, :, p], sure[:, :, p]) for p in range(found.shape[2])]
 
 
+def _detections(
+    arm: _Arm, sightings: Sequence[SimulatedKeypoints], calibration: Calibration | None
+) -> list[Detections]:
+    """Return each camera's usable keypoints, with probabilities and left and right as `reconstruct` has."""
+    joints, found = tuple(arm.people[0].person.joints), []
+    xy, raw = (np.stack([getattr(own, of) for own in sightings], axis=2) for of in ("xy", "confidence"))
+    sure = np.where(
+        raw >= MIN_CONFIDENCE, raw if calibration is None else calibration.probability(raw, joints), 0.0
+    )
+    for places, confidence in zip(np.where(sure[..., None] > 0, xy, np.nan), sure, strict=True):
+        frame, person = np.nonzero(confidence.any(axis=2))
+        own = places[frame, person], confidence[frame, person]
+        track = Detections(joints, frame, person, *own, np.arange(len(arm.t_ns)))
+        found.append(undo_swaps_of_tracks(track, arm.t_ns)[0])
+    return found
+
+
 def _corrected(
-    arm: _Arm, sightings: Sequence[SimulatedKeypoints], parts: Sequence[Path], *, seed: int, draw: int
+    arm: _Arm,
+    sightings: Sequence[SimulatedKeypoints],
+    detections: Sequence[Detections],
+    parts: Sequence[Path],
+    *,
+    seed: int,
+    draw: int,
 ) -> list[Camera]:
     """Disturb an arm's poses, and correct them by backgrounds and ground, as `auto` does."""
-    t_ns, joints, rows = arm.t_ns, tuple(arm.people[0].person.joints), np.arange(len(arm.t_ns))
+    t_ns, rows = arm.t_ns, np.arange(len(arm.t_ns))
     logged = views_of(arm.people[0], arm.seen_by, sightings[0], arm.noise, seed=seed, trial=draw)
     cameras: list[Camera] = []
     followed: dict[str, Followed | str] = {}
     stills: dict[str, Stills] = {}
     for k, (name, part) in enumerate(zip(arm.names, parts, strict=True)):
-        xy, confidence = (
-            np.stack([getattr(own, field)[k] for own in sightings], axis=1) for field in ("xy", "confidence")
-        )
-        frame, person = np.nonzero(np.isfinite(xy[..., 0]).any(axis=2))
-        found = Detections(joints, frame, person, xy[frame, person], confidence[frame, person], rows)
         attitude = quaternion_from_matrix(logged.rotation[:, k])
         camera = Camera(
             name,
@@ -447,7 +482,7 @@ def _corrected(
             Trajectory(t_ns, logged.position[:, k], attitude),
             static=False,
             sigma=logged.pose_sigma[:, k],
-            detections=found,
+            detections=detections[k],
         )
         with np.load(part / "background.npz") as stored:
             tracks = Tracks(stored["picture"], stored["point"], stored["xy"])
@@ -467,22 +502,61 @@ def _between(t_ns: Int64) -> Interpolation:
     return Interpolation(max_gap_s=float(np.ptp(t_ns)) / 1e9, max_extrapolation_s=0.0)
 
 
+def _observed(arm: _Arm, cameras: Sequence[Camera]) -> Observations:
+    """Observe the P people of an arm in the detections that `auto` takes for them.
+
+    Who is who of several is known; an only person is chosen by their log and by the rays of all cameras, so
+    that a tree that a detector takes for a person is nobody.
+    """
+    own, between = list(cameras), _between(arm.t_ns)
+    found = candidates(own, between)
+    sigma = ray_sigma(own, found.t_ns, found.position)
+    if len(arm.people) > 1:
+        choice = np.full((*found.frame.shape, len(arm.people)), -1)
+        for c, camera in enumerate(own):
+            seen = camera.detections
+            first = np.searchsorted(seen.frame, seen.frame)
+            choice[seen.frame, c, seen.person] = np.arange(len(seen.frame)) - first
+    else:
+        views = SightLines(found.rays, found.confidence, found.position, found.rotation, sigma)
+        elapsed_s = (found.t_ns - found.t_ns[0]) / 1e9
+        actors = np.stack(arm.logged, axis=1) if arm.logged else None
+        choice = associate(elapsed_s, *views, actors=actors).choice
+    observed = observe(own, found, choice, arm.t_ns, between)
+    sides = np.empty(observed.confidence.shape, dtype=np.int64)
+    for p in range(len(arm.people)):
+        sides[:, p], _ = swaps_across_views(
+            observed.rays[:, p], observed.position, observed.rotation, sigma, observed.joints
+        )
+    rays, confidence = on_sides(observed.rays, observed.confidence, sides)
+    return replace(observed, rays=rays, confidence=confidence)
+
+
 def _measured(
-    arm: _Arm, of: Walk, sightings: SimulatedKeypoints, cameras: Sequence[Sequence[Camera]], *, seed: int
+    arm: _Arm,
+    person: int,
+    sightings: SimulatedKeypoints,
+    cameras: Sequence[Sequence[Camera]],
+    observed: Sequence[Observations],
 ) -> tuple[Float, MeasuredJoints, dict[str, Any]]:
     """Reconstruct a person [T, J, 3] in cameras [K, N] of K draws, with errors, and measure the arm."""
-    elapsed_s = (of.t_ns - of.t_ns[0]) / 1e9
+    of, elapsed_s = arm.people[person], (arm.t_ns - arm.t_ns[0]) / 1e9
+    joints, count = of.person.joints, len(arm.names)
 
     def reconstructed(draw: int) -> tuple[Float, str | None]:
-        own = cameras[draw]
-        views = views_of(of, arm.seen_by, sightings, arm.noise, seed=seed, trial=draw)
-        poses = zip(*(camera.poses_at(of.t_ns, _between(of.t_ns)) for camera in own), strict=True)
-        position, rotation = (np.stack(part, axis=1) for part in poses)
-        sigma = np.stack([np.asarray(camera.sigma) for camera in own], axis=1)
-        views = replace(views, position=position, rotation=rotation, pose_sigma=sigma)
+        own, seen = cameras[draw], observed[draw]
+        views = Views(
+            rays=seen.rays[:, person].reshape(-1, count, 2),
+            weight=seen.confidence[:, person].reshape(-1, count),
+            pose_index=np.repeat(np.arange(len(arm.t_ns)), len(joints)),
+            position=seen.position,
+            rotation=seen.rotation,
+            focal=np.array([camera.focal_px for camera in own]),
+            pixel_sigma=np.full(count, PIXEL_SIGMA_PX),
+            pose_sigma=np.stack([np.asarray(camera.sigma) for camera in own], axis=1),
+        )
         prior = [errors for camera in own if (errors := camera.errors) is not None]
         corrected = any(camera.modes is not None for camera in own)
-        joints = of.person.joints
         _, found, doubt = refined_points(views, elapsed_s, joints, prior, measured=corrected)
         return found.reshape(of.joints.shape), doubt
 
@@ -503,11 +577,20 @@ def _measured(
 
 
 def _detect_as_filmed(
-    arm: _Arm, sightings: SimulatedKeypoints, _pixels: Float, _free: Bool, camera: Float, *_: object
+    arm: _Arm,
+    person: int,
+    cameras: Sequence[Camera],
+    observed: Observations,
+    _pixels: Float,
+    _free: Bool,
+    camera: Float,
+    *_: object,
 ) -> tuple[Float, Float]:
-    """Return what was detected in the film of the camera at `camera` [T, 3] m (`replay.Detect`)."""
+    """Return what `auto` used of the film of the camera at `camera` [T, 3] m (`replay.Detect`)."""
     which = [np.array_equal(path, camera) for path in arm.seen_by.position].index(True)
-    return sightings.xy[which], sightings.confidence[which]
+    rays = observed.rays[:, person, :, which]
+    along = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1)
+    return project(along, cameras[which].intrinsics), observed.confidence[:, person, :, which]
 
 
 def _modelled(

@@ -60,7 +60,7 @@ from pipelines.simulation.detector_errors import (
 )
 from pipelines.simulation.scenario import DetectorErrors
 
-REPLAN_STAGE = Stage("replan", revision=22)
+REPLAN_STAGE = Stage("replan", revision=23)
 
 _SKELETON = "reconstruct/skeleton.parquet"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")

@@ -570,7 +570,13 @@ def measure(
         eyes, others = paths.position[:, :, None], paths.others[:, None, :, None]
         free &= ~hidden_by_people(eyes, standing_in, others)
     error = np.empty((trials, times, count), dtype=np.float32)
-    smoother = _Smoother(paths, standing_in)
+    knees = paths.middle - [0.0, 0.0, HIPS_ABOVE_GROUND_M / 2]
+    near_ground = looked(
+        maps,
+        lambda field, rows: visible(field, paths.position[:, rows], knees[rows], start_m=start_m),
+        axis=1,
+    )
+    smoother = _Smoother(paths, standing_in, near_ground)
     true_rotation = matrix_from_quaternion(paths.quaternion_xyzw)
     for together in np.array_split(
         np.arange(trials), min(trials, 1 + trials * known.size // ERRORS_TOGETHER)
@@ -618,11 +624,13 @@ class _Smoother:
     with its keypoints. The error that all joints share is that of a linear estimate with the unknowns and the
     evidence of `auto`. Its background leaves each camera a shift, a rotation and a scale of its whole path
     about its middle (7 numbers). Unknown are these, the constant and slow errors of the log, and the shared
-    error at each time. Evidence are the log, the ground that cameras share near the person, the mean keypoint
-    of each picture, and the smoothness of the shared error.
+    error at each time. Evidence are the log, the ground near the person while two cameras see it, the mean
+    keypoint of each picture, and the smoothness of the shared error. `ground` is where cameras see that
+    ground, [N, T]: nothing hides the person's knees.
     """
 
-    def __init__(self, paths: CameraPaths, joints: Float) -> None:
+    def __init__(self, paths: CameraPaths, joints: Float, ground: Bool) -> None:
+        self._ground = ground
         step_s = float(np.median(np.diff(paths.t_ns))) / 1e9 if len(paths.t_ns) > 1 else 1.0
         change = np.diff(paths.joints, 2, axis=0) / step_s**2
         shared = change.mean(axis=1, keepdims=True) if change.size else change
@@ -691,9 +699,11 @@ class _Smoother:
             right[mine] = _squared(of.of_log, errors)
             right[mine][:7] -= _squared(of.at_person, seen[i])
             paired[i, :, i] += _squared(of.at_person, pulled[i])
-            for k, other in enumerate(own):
-                both = _squared(of.at_ground, other.at_ground) / (times * GROUND_SIGMA_M**2)
-                paired[i, :, k] += (cameras - 1) * both if i == k else -both
+            for k in range(i):
+                rows = self._ground[i] & self._ground[k]
+                differ = np.concatenate([of.at_ground[rows], -own[k].at_ground[rows]], axis=-1)
+                both = _squared(differ, differ).reshape(2, 7, 2, 7) / (times * GROUND_SIGMA_M**2)
+                paired[np.ix_([i, k], range(7), [i, k], range(7))] += both
         # The shared error is eliminated: it is smooth, whatever the cameras are.
         sides = np.concatenate([seen.sum(axis=0), *pulled], axis=-1)
         smoothed = smooth(sides, weight.sum(axis=0), self._stiffness[0])
