@@ -285,8 +285,7 @@ def flyable(seed: int) -> tuple[dict[str, Any], list[str]]:
 
 def films(options: argparse.Namespace) -> Lines:
     """Compare `adaptive` with the flight as flown, as modelled and as filmed."""
-    rows: list[list[Float]] = []
-    table: list[list[str]] = []
+    rows, table = list[list[Float]](), list[list[str]]()
     held, left_out = np.zeros(2, int), Counter[str]()
     for seed in count(options.first or 0):
         if len(rows) == (options.count or 10):
@@ -313,9 +312,9 @@ def films(options: argparse.Namespace) -> Lines:
     header = [f"{of.replace('_', ' ')}, {figure}" for figure in FIGURES[::2] for of in KINDS[::2]]
     lines = [*markdown_table(["world", *header], table), ""]
     reasons = ", ".join(f"{number} for {reason}" for reason, number in left_out.items()) or "none"
-    hold = f"{held[0]} (mm) and {held[1]} (points) hold"
-    lines += [f"Of {len(rows)} intervals (95 %), {hold}; left out: {reasons}."]
-    return [*lines, "", *(calibration(np.array(rows)) if len(rows) > 2 else [])]
+    hold = f"Of {len(rows)} intervals (95 %), {held[0]} (mm) and {held[1]} (points) hold"
+    lines += [f"{hold}; left out: {reasons}.", ""]
+    return [*lines, *(calibration(np.array(rows)) if len(rows) > 2 else [])]
 
 
 def differences(one: Float, other: Float) -> Float:
@@ -335,8 +334,7 @@ def calibration(of: Float) -> Lines:
         noise = max(spread[0] - spread[1], 0.0)  # without what poses change in both
         most = np.sqrt(max(1.0 - noise / mean[2].var(), 0.0))
         agree = [np.corrcoef(mean[i], mean[2])[0, 1] for i in range(2)]
-        off = np.sqrt(np.mean((mean[0] - mean[2]) ** 2))
-        values = [*agree, most, off, mean[2].std()]
+        values = [*agree, most, np.sqrt(np.mean((mean[0] - mean[2]) ** 2)), mean[2].std()]
         rows.append([figure, *(fixed(value, 2 if i < 3 else 1) for i, value in enumerate(values))])
     header = ["figure", "correlation", "by keypoints", "perfect model", "off by (RMS)", "spread of filmed"]
     return markdown_table(header, rows)

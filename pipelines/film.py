@@ -7,6 +7,7 @@ The model also measures with the film's keypoints, which tells its detector's pa
 `replan` is only read.
 """
 
+import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -25,13 +26,10 @@ from pipelines.geometry.cameras import project
 from pipelines.geometry.noise import NoiseModel, pose_errors
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import PIXEL_SIGMA_PX, Views
-from pipelines.keypoints.association import associate
-from pipelines.keypoints.bodies import SightLines
 from pipelines.keypoints.corrections import (
     Calibration,
     measured_for,
     read_calibration,
-    swaps_across_views,
     undo_swaps_of_tracks,
 )
 from pipelines.keypoints.search import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
@@ -42,6 +40,7 @@ from pipelines.planning.distance_field import DistanceField, distance_field, in_
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.replay import CameraPaths, MeasuredJoints, joined, known_from, measure, poses_from
 from pipelines.planning.scene import LoggedFlight, load_flight
+from pipelines.reconstruct import agreeing_sides, find_people
 from pipelines.reconstruction.background import refine_cameras
 from pipelines.reconstruction.background_tracks import (
     Followed,
@@ -52,9 +51,8 @@ from pipelines.reconstruction.background_tracks import (
     people_boxes,
 )
 from pipelines.reconstruction.ground import bind_positions
-from pipelines.reconstruction.observations import Camera, Observations, candidates, observe, on_sides
+from pipelines.reconstruction.observations import Camera, Observations, observe, on_sides
 from pipelines.reconstruction.refining import refined_points
-from pipelines.reconstruction.solving import ray_sigma
 from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -102,16 +100,8 @@ class FilmSettings:
 
 def film_settings(stated: str) -> tuple[FilmSettings, Path | None]:
     """Read `HZ[,KEY=VALUE...]`, and the scenario; ValueError: a wrong key or number."""
-    rate_hz, *parts = stated.split(",")
-    values = {"rate_hz": rate_hz}
-    for part in parts:
-        key = part.partition("=")[0]
-        if key in ("start", "end", "detector", "scenario"):
-            values[key] = part.partition("=")[2]
-        elif len(values) > 1 and list(values)[-1] in ("detector", "scenario"):
-            values[list(values)[-1]] += f",{part}"
-        else:
-            raise ValueError(f"{part!r} is none of start=S, end=S, detector=NAME and scenario=FILE")
+    rate_hz, *parts = re.split(",(?=(?:start|end|detector|scenario)=)", stated)
+    values = {"rate_hz": rate_hz} | dict(part.split("=", 1) for part in parts)
     numbers = {}
     for key, low, high in (("rate_hz", 0.1, 30.0), ("start", 0.0, 1e6), ("end", 0.0, 1e6)):
         if key in values:
@@ -205,7 +195,7 @@ def film(
             ]
             sightings = _read_sightings(parts)
             seed = compared.settings["seed"]  # one draw of the comparison's pose noise
-            found = _detections(arm, sightings, calibration)
+            found = _detections(arm, parts, calibration)
             cameras = [
                 _corrected(arm, sightings, found, parts, seed=seed, draw=draw) for draw in range(DRAWS)
             ]
@@ -269,7 +259,7 @@ class _Arm:
     people: list[Walk]
     tilt_rad: Float | None  # [N, T] above whom each camera films; None for one person
     seen_by: CameraFormation
-    logged: list[Float]  # positions [T, 3] m of each logged person
+    logged: Sequence[LoggedActor]
     known: Bool  # [N, T] False where a log has a gap, or a battery is empty: nothing is detected there
     noise: tuple[NoiseModel, ...]
 
@@ -337,13 +327,12 @@ def _arm(
     lens = replace(flight.cameras[0].intrinsics, readout_s=0.0)  # each picture is of one moment
     seen_by = CameraFormation(position.take(rows, axis=1), quaternion.take(rows, axis=1), lens)
     tilt = table["tilt_rad"].to_numpy(np.float64).reshape(-1, len(cameras)).T
-    hips = [person.hips_at(moments) for person in logged]
     return _Arm(
         cameras,
         people,
         tilt.take(rows, axis=1) if len(people) > 1 else None,
         seen_by,
-        hips,
+        logged,
         known_from(table, len(cameras))[:, rows],
         flight.cameras[0].noise,
     )
@@ -374,6 +363,7 @@ def _film_camera(
     joints = len(arm.people[0].person.joints)
     nobody = np.empty((0, joints, 2)), np.empty((0, joints))
     background, stills = Follower(), _stills(arm.t_ns)
+    hips_of_all = [person.hips_at(arm.t_ns) for person in arm.logged]
     greys: list[Picture] = []
 
     def pictures() -> Iterator[Picture]:
@@ -386,7 +376,7 @@ def _film_camera(
             greys.extend([grey] if k in stills else [])
             hints = [
                 project_actor(hips[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD)
-                for hips in arm.logged
+                for hips in hips_of_all
             ]
             seen = follower.step(picture, hints=hints) if arm.known[camera, k] else nobody
             found.append(_whose(arm, pose, k, *seen))
@@ -439,20 +429,18 @@ def _read_sightings(parts: Sequence[Path]) -> list[SimulatedKeypoints]:
     return [SimulatedKeypoints(found[:, :, p], sure[:, :, p]) for p in range(found.shape[2])]
 
 
-def _detections(
-    arm: _Arm, sightings: Sequence[SimulatedKeypoints], calibration: Calibration | None
-) -> list[Detections]:
+def _detections(arm: _Arm, parts: Sequence[Path], calibration: Calibration | None) -> list[Detections]:
     """Return each camera's usable keypoints, with probabilities and left and right as `reconstruct` has."""
     joints, found = tuple(arm.people[0].person.joints), []
-    xy, raw = (np.stack([getattr(own, of) for own in sightings], axis=2) for of in ("xy", "confidence"))
-    sure = np.where(
-        raw >= MIN_CONFIDENCE, raw if calibration is None else calibration.probability(raw, joints), 0.0
-    )
-    for places, confidence in zip(np.where(sure[..., None] > 0, xy, np.nan), sure, strict=True):
-        frame, person = np.nonzero(confidence.any(axis=2))
-        own = places[frame, person], confidence[frame, person]
-        track = Detections(joints, frame, person, *own, np.arange(len(arm.t_ns)))
-        found.append(undo_swaps_of_tracks(track, arm.t_ns)[0])
+    for part in parts:
+        with np.load(part / "keypoints.npz") as stored:
+            xy, raw = stored["xy"], stored["confidence"]
+        sure = raw if calibration is None else calibration.probability(raw, joints)
+        sure = np.where(raw >= MIN_CONFIDENCE, sure, 0.0)
+        frame, person = np.nonzero(sure.any(axis=2))
+        places = np.where(sure[..., None] > 0, xy, np.nan)[frame, person]
+        own = Detections(joints, frame, person, places, sure[frame, person], np.arange(len(arm.t_ns)))
+        found.append(undo_swaps_of_tracks(own, arm.t_ns)[0])
     return found
 
 
@@ -502,32 +490,22 @@ def _between(t_ns: Int64) -> Interpolation:
     return Interpolation(max_gap_s=float(np.ptp(t_ns)) / 1e9, max_extrapolation_s=0.0)
 
 
-def _observed(arm: _Arm, cameras: Sequence[Camera]) -> Observations:
+def _observed(arm: _Arm, cameras: list[Camera]) -> Observations:
     """Observe the P people of an arm in the detections that `auto` takes for them.
 
     Who is who of several is known; an only person is chosen by their log and by the rays of all cameras, so
     that a tree that a detector takes for a person is nobody.
     """
-    own, between = list(cameras), _between(arm.t_ns)
-    found = candidates(own, between)
-    sigma = ray_sigma(own, found.t_ns, found.position)
+    between = _between(arm.t_ns)
+    found, association, sigma = find_people(cameras, between, arm.logged)
+    choice = association.choice
     if len(arm.people) > 1:
         choice = np.full((*found.frame.shape, len(arm.people)), -1)
-        for c, camera in enumerate(own):
-            seen = camera.detections
-            first = np.searchsorted(seen.frame, seen.frame)
-            choice[seen.frame, c, seen.person] = np.arange(len(seen.frame)) - first
-    else:
-        views = SightLines(found.rays, found.confidence, found.position, found.rotation, sigma)
-        elapsed_s = (found.t_ns - found.t_ns[0]) / 1e9
-        actors = np.stack(arm.logged, axis=1) if arm.logged else None
-        choice = associate(elapsed_s, *views, actors=actors).choice
-    observed = observe(own, found, choice, arm.t_ns, between)
-    sides = np.empty(observed.confidence.shape, dtype=np.int64)
-    for p in range(len(arm.people)):
-        sides[:, p], _ = swaps_across_views(
-            observed.rays[:, p], observed.position, observed.rotation, sigma, observed.joints
-        )
+        for c, seen in enumerate(camera.detections for camera in cameras):
+            rank = np.arange(len(seen.frame)) - np.searchsorted(seen.frame, seen.frame)
+            choice[seen.frame, c, seen.person] = rank
+    observed = observe(cameras, found, choice, arm.t_ns, between)
+    sides, _ = agreeing_sides(observed, sigma)
     rays, confidence = on_sides(observed.rays, observed.confidence, sides)
     return replace(observed, rays=rays, confidence=confidence)
 

@@ -866,7 +866,7 @@ def _observe(flight: LoadedFlight, cameras: list[Camera]) -> _Seen:
     observations = observe(cameras, found, association.choice, base, between)
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     anybody = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
-    sides, between_views = _agreeing_sides(observations, sigma[nearest])
+    sides, between_views = agreeing_sides(observations, sigma[nearest])
     rays, confidence = on_sides(observations.rays, observations.confidence, sides)
     observations = replace(observations, rays=rays, confidence=confidence)
     return _Seen(found, association, observations, sides, between_views, anybody)
@@ -936,7 +936,7 @@ def _poses_stored(
     return camera_poses_table(corrected, between) if corrected else None
 
 
-def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, dict[str, int]]:
+def agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, dict[str, int]]:
     """Find the sides [T, P, J, C] on which most cameras agree; see `swaps_across_views`."""
     sides = np.empty(observations.confidence.shape, dtype=np.int64)
     total: Counter[str] = Counter()

@@ -561,21 +561,18 @@ def measure(
     pixels = np.stack([_pixels(paths, i) for i in range(cameras)])
     known = np.isfinite(joints[..., 0])
     standing_in = np.where(known[..., None], joints, paths.middle[:, None])
-    free = looked(
+    knees = paths.middle[:, None] - [0.0, 0.0, HIPS_ABOVE_GROUND_M / 2]
+    looked_at = np.concatenate([standing_in, knees], axis=1)
+    sights_free = looked(
         maps,
-        lambda field, rows: visible(field, paths.position[:, rows, None], standing_in[rows], start_m=start_m),
+        lambda field, rows: visible(field, paths.position[:, rows, None], looked_at[rows], start_m=start_m),
         axis=1,
     )
+    free, near_ground = sights_free[..., :-1], sights_free[..., -1]
     if paths.others is not None and len(paths.others):
         eyes, others = paths.position[:, :, None], paths.others[:, None, :, None]
         free &= ~hidden_by_people(eyes, standing_in, others)
     error = np.empty((trials, times, count), dtype=np.float32)
-    knees = paths.middle - [0.0, 0.0, HIPS_ABOVE_GROUND_M / 2]
-    near_ground = looked(
-        maps,
-        lambda field, rows: visible(field, paths.position[:, rows], knees[rows], start_m=start_m),
-        axis=1,
-    )
     smoother = _Smoother(paths, standing_in, near_ground)
     true_rotation = matrix_from_quaternion(paths.quaternion_xyzw)
     for together in np.array_split(

@@ -195,7 +195,7 @@ def test_what_is_stored(mound: Path, at_the_mound: dict[str, Any]) -> None:
 
 
 def test_unchanged_is_skipped_and_forced_is_the_same(calm: Path) -> None:
-    once = ("--trials", "2", "--arms", "fixed,flown")
+    once = ("--trials", "2", "--arms", "adaptive,joint,flown")
     first = compare(calm, *once)
     assert "written" in first.stdout
     before = content(calm)

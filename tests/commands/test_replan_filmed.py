@@ -2,7 +2,9 @@
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,6 +93,38 @@ def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:
         film(session)
 
 
+def film_without_renderer(
+    session: Path, monkeypatch: pytest.MonkeyPatch, show: Callable[[Float, int], Float], end_s: float
+) -> tuple[Float, Float, dict[str, Any]]:
+    """Film arm `fixed`; `show` makes detections [K, J, 2] of people's pixels [P, J, 2] in a numbered picture.
+
+    Return the true joints [T, P, J, 3] of the first camera's pictures, those found, and the arm's figures.
+    """
+    assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
+    motion, shown = read_motion(session / "truth.parquet", TRUTH), list[Float]()
+    truth = motion.position[::2]
+    lens = read_description(session).cameras["drone1"].intrinsics
+
+    def picture(
+        _: Renderer, position: Float, quaternion: Float, bodies: list[TriangleSurface], frame: int
+    ) -> object:
+        for body, joints in zip(bodies, truth[frame], strict=True):  # the middles of both differ
+            np.testing.assert_allclose(body.vertices.mean(axis=0), joints.mean(axis=0), atol=0.3)
+        true = np.array([see(person, position, quaternion, lens) for person in truth[frame]])
+        shown.append(show(true, len(shown)))
+        return np.zeros((360, 640, 3), np.uint8)
+
+    def step(*_: object, **__: object) -> tuple[Float, Float]:
+        return shown[-1], np.ones(shown[-1].shape[:-1])
+
+    monkeypatch.setattr(Renderer, "picture", picture)
+    monkeypatch.setattr("pipelines.film.FollowedPeople.step", step)
+    settings = FilmSettings(rate_hz=5.0, end_s=end_s, detector=spot_detector(session.parent))
+    figures = film(session, settings).metrics["arms"]["fixed"]
+    found = read_motion(session / "film/fixed/skeleton.parquet", TRUTH, motion.joints)
+    return truth, found.position, figures
+
+
 def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both people are in the pictures where the truth has them, and both are measured."""
     people = (
@@ -99,44 +133,29 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
     )
     text = SHORT.replace("actor: {motion: [walk: {distance_m: 5}], estimate_sigma_m: 0.02}", people)
     session = session_of(tmp_path, text)
-    assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
-    truth = read_motion(session / "truth.parquet", TRUTH)
-    joints = truth.position  # [T, P, J, 3]
-    lens = read_description(session).cameras["drone1"].intrinsics
-    rendered, shown = [], []
 
-    def picture(
-        _: Renderer, position: Float, quaternion: Float, people: list[TriangleSurface], frame: int
-    ) -> object:
-        rendered.append([person.vertices.mean(axis=0) for person in people])
-        shown.append([see(person, position, quaternion, lens) for person in joints[frame]])
-        return np.zeros((360, 640, 3), np.uint8)
+    def everybody_and_a_tree(true: Float, _: int) -> Float:
+        return np.array([*true[::-1], true[0] + 80.0])
 
-    class Everybody:
-        """Detector that finds the people's true joints, Ben's first, and a body where nobody is."""
-
-        def __init__(self, *_: object, only_one: bool) -> None:
-            assert not only_one
-
-        def step(self, *_: object, **__: object) -> tuple[Float, Float]:
-            xy = np.array([*shown[-1][::-1], shown[-1][0] + 80.0])
-            return xy, np.ones(xy.shape[:-1])
-
-    monkeypatch.setattr(Renderer, "picture", picture)
-    monkeypatch.setattr("pipelines.film.FollowedPeople", Everybody)
-    settings = FilmSettings(rate_hz=5.0, end_s=0.5, detector=spot_detector(tmp_path))
-    figures = film(session, settings).metrics["arms"]["fixed"]
-    assert len(rendered) == 6
-    for people_seen in rendered:  # both stand; the middles of a body and of its joints differ
-        np.testing.assert_allclose(people_seen, joints.mean(axis=(0, 2)), atol=0.3)
-
+    truth, found, figures = film_without_renderer(session, monkeypatch, everybody_and_a_tree, 0.5)
+    assert figures["pictures"] == 6
     anna, ben = figures["by_person"].values()
     assert list(figures["by_person"]) == ["anna", "ben"]
     assert anna["detected_share"] == ben["detected_share"] == 1.0
     assert max(anna["keypoint_median_px"], ben["keypoint_median_px"]) < 0.1
     assert max(anna["mpjpe_mm"], ben["mpjpe_mm"]) < 1.0  # exact poses and keypoints
     assert figures["mpjpe_mm"] == pytest.approx((anna["mpjpe_mm"] + ben["mpjpe_mm"]) / 2)
-    found = read_motion(session / "film" / "fixed" / "skeleton.parquet", TRUTH, truth.joints)
-    np.testing.assert_allclose(found.position, joints[:3], atol=0.01)
+    np.testing.assert_allclose(found, truth[:3], atol=0.01)
     with np.load(session / "film" / "fixed" / "errors.npz") as errors:
         np.testing.assert_allclose(errors["by_keypoints"], errors["filmed"], atol=1e-4)
+
+
+def test_somebody_else_in_one_camera_is_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From its sixth picture on, the first camera shows a body 150 px aside: nothing is measured then."""
+
+    def aside(true: Float, number: int) -> Float:
+        return np.asarray(true + np.array([150.0 * (5 <= number < 9), 0.0]))
+
+    session = session_of(tmp_path, SHORT)
+    truth, found, _ = film_without_renderer(session, monkeypatch, aside, 2.0)
+    np.testing.assert_allclose(found, truth[:5], atol=0.02)
