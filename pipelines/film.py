@@ -25,7 +25,6 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import project
 from pipelines.geometry.noise import NoiseModel, pose_errors
 from pipelines.geometry.poses import quaternion_from_matrix
-from pipelines.geometry.triangulation import PIXEL_SIGMA_PX, Views
 from pipelines.keypoints.corrections import (
     Calibration,
     measured_for,
@@ -53,6 +52,7 @@ from pipelines.reconstruction.background_tracks import (
 from pipelines.reconstruction.ground import bind_positions
 from pipelines.reconstruction.observations import Camera, Observations, observe, on_sides
 from pipelines.reconstruction.refining import refined_points
+from pipelines.reconstruction.solving import views_as_stated
 from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -219,12 +219,8 @@ def film(
             write_table(out / "skeleton.parquet", motion_table(motion), TRUTH)
             for camera, part in zip(arm.names, parts, strict=True):
                 shutil.copyfile(part / "pictures.mp4", out / f"{camera}.mp4")
-            np.savez(
-                out / "errors.npz",
-                filmed=errors[name].error_m,
-                modelled=modelled[name].error_m,
-                by_keypoints=by_keypoints,
-            )
+            filmed_m, modelled_m = errors[name].error_m, modelled[name].error_m
+            np.savez(out / "errors.npz", filmed=filmed_m, modelled=modelled_m, by_keypoints=by_keypoints)
         t_ns = next(iter(arms.values())).t_ns
         shared = common_frames({name: own.error_m for name, own in errors.items()})
         for name, own in errors.items():
@@ -519,23 +515,14 @@ def _measured(
 ) -> tuple[Float, MeasuredJoints, dict[str, Any]]:
     """Reconstruct a person [T, J, 3] in cameras [K, N] of K draws, with errors, and measure the arm."""
     of, elapsed_s = arm.people[person], (arm.t_ns - arm.t_ns[0]) / 1e9
-    joints, count = of.person.joints, len(arm.names)
 
     def reconstructed(draw: int) -> tuple[Float, str | None]:
         own, seen = cameras[draw], observed[draw]
-        views = Views(
-            rays=seen.rays[:, person].reshape(-1, count, 2),
-            weight=seen.confidence[:, person].reshape(-1, count),
-            pose_index=np.repeat(np.arange(len(arm.t_ns)), len(joints)),
-            position=seen.position,
-            rotation=seen.rotation,
-            focal=np.array([camera.focal_px for camera in own]),
-            pixel_sigma=np.full(count, PIXEL_SIGMA_PX),
-            pose_sigma=np.stack([np.asarray(camera.sigma) for camera in own], axis=1),
-        )
+        alone = {of: getattr(seen, of)[:, person : person + 1] for of in ("rays", "confidence")}
+        views = views_as_stated(own, replace(seen, **alone))
         prior = [errors for camera in own if (errors := camera.errors) is not None]
         corrected = any(camera.modes is not None for camera in own)
-        _, found, doubt = refined_points(views, elapsed_s, joints, prior, measured=corrected)
+        _, found, doubt = refined_points(views, elapsed_s, seen.joints, prior, measured=corrected)
         return found.reshape(of.joints.shape), doubt
 
     points, doubt = reconstructed(0)

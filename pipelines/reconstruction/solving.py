@@ -50,10 +50,16 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float) -> Float:
 
 def views_with_noise(cameras: Sequence[Camera], observations: Observations) -> Views:
     """Build the views; residuals that the stated noise does not explain are added as pixel noise."""
+    views = views_as_stated(cameras, observations)
+    return replace(views, pixel_sigma=estimate_noise(views))
+
+
+def views_as_stated(cameras: Sequence[Camera], observations: Observations) -> Views:
+    """Build the views with the detector's noise and the stated noise of poses alone."""
     times, people, joints, count = observations.confidence.shape
     focal = np.array([camera.focal_px for camera in cameras])
     stated = observations.pose_sigma
-    views = Views(
+    return Views(
         rays=observations.rays.reshape(-1, count, 2),
         weight=observations.confidence.reshape(-1, count),
         pose_index=np.repeat(np.arange(times), people * joints),
@@ -63,7 +69,6 @@ def views_with_noise(cameras: Sequence[Camera], observations: Observations) -> V
         pixel_sigma=np.full(count, PIXEL_SIGMA_PX),
         pose_sigma=np.zeros((times, count, 2)) if stated is None else stated,
     )
-    return replace(views, pixel_sigma=estimate_noise(views))
 
 
 def solver_for(
