@@ -19,7 +19,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json
 from pipelines.session.tables import TRUTH, read_motion
 from pipelines.simulation.detector_errors import see
-from pipelines.simulation.raster import TriangleSurface
 from pipelines.simulation.renderer import Renderer
 from tests.commands.test_replan import compare, refused, session_of
 from tests.keypoints.spotted_flights import spot_detector
@@ -96,21 +95,16 @@ def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:
 def film_without_renderer(
     session: Path, monkeypatch: pytest.MonkeyPatch, show: Callable[[Float, int], Float], end_s: float
 ) -> tuple[Float, Float, dict[str, Any]]:
-    """Film arm `fixed`; `show` makes detections [K, J, 2] of people's pixels [P, J, 2] in a numbered picture.
-
-    Return the true joints [T, P, J, 3] of the first camera's pictures, those found, and the arm's figures.
-    """
+    """Film arm `fixed` with detections [K, J, 2] by `show`; return joints, those found, and the figures."""
     assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
     motion, shown = read_motion(session / "truth.parquet", TRUTH), list[Float]()
     truth = motion.position[::2]
     lens = read_description(session).cameras["drone1"].intrinsics
 
-    def picture(
-        _: Renderer, position: Float, quaternion: Float, bodies: list[TriangleSurface], frame: int
-    ) -> object:
+    def picture(_: object, position: Float, turn: Float, bodies: Any, frame: int) -> object:
         for body, joints in zip(bodies, truth[frame], strict=True):  # the middles of both differ
             np.testing.assert_allclose(body.vertices.mean(axis=0), joints.mean(axis=0), atol=0.3)
-        true = np.array([see(person, position, quaternion, lens) for person in truth[frame]])
+        true = np.array([see(person, position, turn, lens) for person in truth[frame]])
         shown.append(show(true, len(shown)))
         return np.zeros((360, 640, 3), np.uint8)
 
@@ -119,10 +113,9 @@ def film_without_renderer(
 
     monkeypatch.setattr(Renderer, "picture", picture)
     monkeypatch.setattr("pipelines.film.FollowedPeople.step", step)
-    settings = FilmSettings(rate_hz=5.0, end_s=end_s, detector=spot_detector(session.parent))
-    figures = film(session, settings).metrics["arms"]["fixed"]
+    done = film(session, FilmSettings(5.0, None, end_s, spot_detector(session.parent)))
     found = read_motion(session / "film/fixed/skeleton.parquet", TRUTH, motion.joints)
-    return truth, found.position, figures
+    return truth, found.position, done.metrics["arms"]["fixed"]
 
 
 def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,12 +126,9 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
     )
     text = SHORT.replace("actor: {motion: [walk: {distance_m: 5}], estimate_sigma_m: 0.02}", people)
     session = session_of(tmp_path, text)
-
-    def everybody_and_a_tree(true: Float, _: int) -> Float:
-        return np.array([*true[::-1], true[0] + 80.0])
-
-    truth, found, figures = film_without_renderer(session, monkeypatch, everybody_and_a_tree, 0.5)
-    assert figures["pictures"] == 6
+    truth, found, figures = film_without_renderer(
+        session, monkeypatch, lambda true, _: np.array([*true[::-1], true[0] + 80.0]), 0.5
+    )
     anna, ben = figures["by_person"].values()
     assert list(figures["by_person"]) == ["anna", "ben"]
     assert anna["detected_share"] == ben["detected_share"] == 1.0
@@ -152,10 +142,8 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
 
 def test_somebody_else_in_one_camera_is_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From its sixth picture on, the first camera shows a body 150 px aside: nothing is measured then."""
-
-    def aside(true: Float, number: int) -> Float:
-        return np.asarray(true + np.array([150.0 * (5 <= number < 9), 0.0]))
-
     session = session_of(tmp_path, SHORT)
-    truth, found, _ = film_without_renderer(session, monkeypatch, aside, 2.0)
+    truth, found, _ = film_without_renderer(
+        session, monkeypatch, lambda true, k: np.asarray(true + np.array([150.0 * (5 <= k < 9), 0.0])), 2.0
+    )
     np.testing.assert_allclose(found, truth[:5], atol=0.02)
