@@ -46,7 +46,7 @@ _RIG = _HUMAN + "rigs/standard/"
 
 # How far to go from MakeHuman's average weight towards, and beyond, its least and most, which are mild.
 _WEIGHTS = {"average": ("minweight", 0.0), "slim": ("minweight", 1.3), "heavy": ("maxweight", 2.0)}
-_ORIGINS = ("african", "asian", "caucasian")  # a third each
+ORIGINS = ("african", "asian", "caucasian")  # a third each
 
 # Fingers, which have no bones of their own here, move with the hand.
 _MIXAMO = {
@@ -98,21 +98,23 @@ def write_asset(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _make(wheel: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
-    mesh = _read_mesh(wheel)
-    bodies = {(sex, build): _shape(wheel, mesh.vertices, sex, build) for sex in SEXES for build in BUILDS}
-    mirror = _read_mirror(wheel)
-    weights = _bone_weights(wheel, len(mesh.vertices), mirror)
+    mesh = read_mesh(wheel)
+    bodies = {
+        (sex, build): shaped_body(wheel, mesh.vertices, sex, build) for sex in SEXES for build in BUILDS
+    }
+    mirror = read_mirror(wheel)
+    weights = bone_weights(wheel, len(mesh.vertices), mirror)
     example = bodies["male", "average"]
-    part = _parts(wheel, example, _rest_joints(wheel, example))
-    quads = _visible_quads(wheel, mesh, weights)
-    keypoints = _read_keypoints(wheel)
+    part = _parts(wheel, example, rest_joints(wheel, example))
+    quads = visible_quads(wheel, mesh, weights)
+    keypoints = read_keypoints(wheel)
 
     wanted = np.concatenate([quads.ravel(), *(vertices for vertices, _ in keypoints)])
     used = np.union1d(wanted, mirror[wanted])
     renamed = np.zeros(len(mesh.vertices), dtype=np.uint16)
     renamed[used] = np.arange(len(used))
     vertices = np.array([[bodies[sex, build][used] for build in BUILDS] for sex in SEXES])
-    joints = np.array([[_rest_joints(wheel, bodies[sex, build]) for build in BUILDS] for sex in SEXES])
+    joints = np.array([[rest_joints(wheel, bodies[sex, build]) for build in BUILDS] for sex in SEXES])
     whole = np.rint(vertices / UNIT_M).astype(np.int16)
     whole[:, 1:] -= whole[:, :1]
     bone, weight = _strongest(weights[used])
@@ -133,12 +135,15 @@ def _make(wheel: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
 # --- the mesh and its shapes ---------------------------------------------------------------------------
 
 
-class _Mesh(NamedTuple):
+class Mesh(NamedTuple):
+    """MakeHuman's base mesh."""
+
     vertices: Float  # [N, 3] decimetres, MakeHuman's axes: x left, y up, z forward
     quads: dict[str, Index]  # [Q, 4] by group
 
 
-def _read_mesh(wheel: zipfile.ZipFile) -> _Mesh:
+def read_mesh(wheel: zipfile.ZipFile) -> Mesh:
+    """Read the base mesh."""
     vertices, quads, group = [], dict[str, list[list[int]]](), ""
     for line in wheel.read(_HUMAN + "3dobjs/base.obj").decode().splitlines():
         kind, *words = line.split() or [""]
@@ -148,25 +153,25 @@ def _read_mesh(wheel: zipfile.ZipFile) -> _Mesh:
             group = words[0]
         elif kind == "f":
             quads.setdefault(group, []).append([int(word.split("/")[0]) - 1 for word in words])
-    return _Mesh(np.array(vertices), {name: np.array(corners) for name, corners in quads.items()})
+    return Mesh(np.array(vertices), {name: np.array(corners) for name, corners in quads.items()})
 
 
-def _shape(wheel: zipfile.ZipFile, neutral: Float, sex: str, build: str) -> Float:
+def shaped_body(wheel: zipfile.ZipFile, neutral: Float, sex: str, build: str) -> Float:
     """Return the vertices [N, 3] m of one sex and build, in our axes, bare soles at z = 0."""
     shaped = neutral.copy()
-    targets = {f"{origin}-{sex}-young": 1 / len(_ORIGINS) for origin in _ORIGINS}
+    targets = {f"{origin}-{sex}-young": 1 / len(ORIGINS) for origin in ORIGINS}
     extreme, far = _WEIGHTS[build]
     targets[f"universal-{sex}-young-averagemuscle-averageweight"] = 1 - far
     targets[f"universal-{sex}-young-averagemuscle-{extreme}"] = far
     for name, share in targets.items():
-        moved, by = _read_target(wheel, f"macrodetails/{name}")
+        moved, by = read_target(wheel, f"macrodetails/{name}")
         shaped[moved] += share * by
     metres = 0.1 * shaped[:, [2, 0, 1]]
-    metres[:, 2] -= metres[_named(wheel, "body"), 2].min()
+    metres[:, 2] -= metres[group_vertices(wheel, "body"), 2].min()
     return metres
 
 
-def _read_target(wheel: zipfile.ZipFile, name: str) -> tuple[Index, Float]:
+def read_target(wheel: zipfile.ZipFile, name: str) -> tuple[Index, Float]:
     """Read the indices [K] of the vertices that a shape moves, and their shifts [K, 3].
 
     Shifts are in decimetres, in MakeHuman's axes.
@@ -177,13 +182,14 @@ def _read_target(wheel: zipfile.ZipFile, name: str) -> tuple[Index, Float]:
     return table[:, 0].astype(np.intp), table[:, 1:]
 
 
-def _named(wheel: zipfile.ZipFile, group: str) -> Index:
+def group_vertices(wheel: zipfile.ZipFile, group: str) -> Index:
     """Return the vertices of one of MakeHuman's groups."""
     groups = json.loads(wheel.read(_HUMAN + "mesh_metadata/basemesh_vertex_groups.json"))
     return np.concatenate([np.arange(first, last + 1) for first, last in groups[group]])
 
 
-def _read_mirror(wheel: zipfile.ZipFile) -> Index:
+def read_mirror(wheel: zipfile.ZipFile) -> Index:
+    """Read each vertex's [N] mirror image."""
     rows = [line.split() for line in wheel.read(_HUMAN + "mesh_metadata/hm08.mirror").decode().splitlines()]
     mirror = np.zeros(len(rows), dtype=np.intp)
     for vertex, other, _ in rows:
@@ -204,7 +210,7 @@ def _ours(mixamo: str) -> str:
     return f"{side}_{_MIXAMO_LIMBS['Hand' if limb.startswith('Hand') else limb]}"
 
 
-def _rest_joints(wheel: zipfile.ZipFile, vertices: Float) -> Float:
+def rest_joints(wheel: zipfile.ZipFile, vertices: Float) -> Float:
     """Return the bones' upper ends [22, 3] m, exact mirror images left and right."""
     rig = json.loads(wheel.read(_RIG + "rig.mixamo.json"))
     joints = np.zeros((len(BONES), 3))
@@ -218,7 +224,7 @@ def _rest_joints(wheel: zipfile.ZipFile, vertices: Float) -> Float:
 
 def _place(wheel: zipfile.ZipFile, rule: dict[str, Any], vertices: Float) -> Float:
     if rule["strategy"] == "CUBE":
-        where = _named(wheel, rule["cube_name"])
+        where = group_vertices(wheel, rule["cube_name"])
     elif rule["strategy"] == "VERTEX":
         where = np.array([rule["vertex_index"]])
     else:
@@ -233,7 +239,7 @@ def _other_side(bone: str) -> str:
     return "left_" + bone.removeprefix("right_") if bone.startswith("right_") else bone
 
 
-def _bone_weights(wheel: zipfile.ZipFile, count: int, mirror: Index) -> Float:
+def bone_weights(wheel: zipfile.ZipFile, count: int, mirror: Index) -> Float:
     """Return the weights [N, 22] of the bones, exact mirror images left and right.
 
     Rows sum to 1. Cubes that mark joints have no weights.
@@ -260,7 +266,7 @@ def _strongest(weights: Float) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
 # --- visible parts -------------------------------------------------------------------------------------
 
 
-def _visible_quads(wheel: zipfile.ZipFile, mesh: _Mesh, weights: Float) -> Index:
+def visible_quads(wheel: zipfile.ZipFile, mesh: Mesh, weights: Float) -> Index:
     """Return the quads [Q, 4] of skin that some outfit bares, of eyes, and of the suit for clothes."""
     skin = mesh.quads["body"]
     inside = np.zeros(len(weights), dtype=np.bool_)
@@ -278,33 +284,33 @@ def _parts(wheel: zipfile.ZipFile, body: Float, joints: Float) -> NDArray[np.uin
     part = np.zeros(len(body), dtype=np.uint8)
     x, y, z = (body - joints[BONE["head"]]).T
     head = np.zeros(len(body), dtype=np.bool_)
-    head[_named(wheel, "body")] = True
-    eyes = np.concatenate([_named(wheel, "helper-l-eye"), _named(wheel, "helper-r-eye")])
+    head[group_vertices(wheel, "body")] = True
+    eyes = np.concatenate([group_vertices(wheel, "helper-l-eye"), group_vertices(wheel, "helper-r-eye")])
     eye_x, eye_z = x[eyes].mean(), z[eyes].mean()
     arch = 0.017 - 0.25 * np.abs(np.abs(y) - 0.035)
     brow = head & (x > eye_x) & (np.abs(np.abs(y) - 0.034) < 0.021) & (np.abs(z - eye_z - arch) < 0.0055)
     part[brow] = PARTS.index("brow")
     for lip in ("upper", "lower"):
-        moved, by = _read_target(wheel, f"mouth/mouth-{lip}lip-volume-incr")
+        moved, by = read_target(wheel, f"mouth/mouth-{lip}lip-volume-incr")
         far = np.linalg.norm(by, axis=1)
         part[moved[far > 0.35 * far.max()]] = PARTS.index("lips")
     for side in ("l", "r"):
-        eye = _named(wheel, f"helper-{side}-eye")
+        eye = group_vertices(wheel, f"helper-{side}-eye")
         part[eye] = PARTS.index("white")
         part[eye[x[eye] > np.percentile(x[eye], 75)]] = PARTS.index("iris")
-    part[_named(wheel, "helper-tights")] = PARTS.index("cloth")
+    part[group_vertices(wheel, "helper-tights")] = PARTS.index("cloth")
     return part
 
 
 def _read_cavities(wheel: zipfile.ZipFile) -> Index:
     """Read the vertices inside mouth and nose and behind the eyes."""
-    found = _unpickle(wheel.read(_DATA + "template_mesh_internal_cavities.pth"))
+    found = unpickle(wheel.read(_DATA + "template_mesh_internal_cavities.pth"))
     return np.array(found["vertex_indices"], dtype=np.intp)
 
 
-def _read_keypoints(wheel: zipfile.ZipFile) -> list[tuple[Index, Float]]:
+def read_keypoints(wheel: zipfile.ZipFile) -> list[tuple[Index, Float]]:
     """Read the vertices of each COCO-17 keypoint and their weights, which sum to 1."""
-    regressor = _unpickle(wheel.read(_DATA + "keypoints/coco.pth"))
+    regressor = unpickle(wheel.read(_DATA + "keypoints/coco.pth"))
     sparse = []
     for joint in get_skeleton("coco17").joints:
         weight = np.asarray(regressor[joint], dtype=np.float64)
@@ -313,7 +319,7 @@ def _read_keypoints(wheel: zipfile.ZipFile) -> list[tuple[Index, Float]]:
     return sparse
 
 
-def _unpickle(stored: bytes) -> dict[str, Any]:
+def unpickle(stored: bytes) -> dict[str, Any]:
     """Read a file of torch without torch: numbers, lists, dicts and flat float tensors, nothing else."""
     archive = zipfile.ZipFile(io.BytesIO(stored))
     (index,) = (name for name in archive.namelist() if name.endswith("data.pkl"))

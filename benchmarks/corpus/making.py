@@ -27,7 +27,7 @@ from benchmarks.corpus.stored import (
 from pipelines.detect import detect, follow
 from pipelines.ingest import ingest
 from pipelines.reconstruction.background_tracks import tracks_path
-from pipelines.session.stages import StageRecord, locked
+from pipelines.session.stages import locked
 from pipelines.session.tables import KEYPOINTS, TRACKS, read_table
 from pipelines.simulate import simulate
 
@@ -63,17 +63,7 @@ def make(flight: Flight, films: Path, workers: int = 1, *, again: bool = False) 
     filmed = film(flight, films, workers)
     session = ingest(filmed / "flight.yaml", films / f"{flight.name}.session").folder
     for detector in missing:
-        record = _detected(session, detector, len(flight.scenario.people), workers)
-        counts = {
-            camera: {key: value for key, value in counted.items() if isinstance(value, int)}
-            for camera, counted in record.counts["cameras"].items()
-        }
-        tables = {
-            camera: read_table(session / "detect" / camera / "keypoints.parquet", KEYPOINTS)
-            for camera in counts
-        }
-        found = Keypoints(tuple(record.counts["joints"]), counts, tables)
-        write_keypoints(flight.keypoints_path(detector), found)
+        keep_detections(flight, session, detector, workers)
     if follows:
         write_backgrounds(flight, _followed(session))
     return True
@@ -91,11 +81,20 @@ def film(flight: Flight, films: Path, workers: int) -> Path:
     return simulate(scenario, films / flight.name, workers=workers).folder
 
 
-def _detected(session: Path, detector: str, people: int, workers: int) -> StageRecord:
+def keep_detections(flight: Flight, session: Path, detector: str, workers: int) -> None:
+    """Detect in the pictures of a flight's session, and write what is kept of it."""
     with locked(session) as writable:
-        record = detect(writable, detector=detector, people=people, workers=workers)
+        record = detect(writable, detector=detector, people=len(flight.scenario.people), workers=workers)
     assert record is not None, "a film was ingested without pictures"
-    return record
+    counts = {
+        camera: {key: value for key, value in counted.items() if isinstance(value, int)}
+        for camera, counted in record.counts["cameras"].items()
+    }
+    tables = {
+        camera: read_table(session / "detect" / camera / "keypoints.parquet", KEYPOINTS) for camera in counts
+    }
+    found = Keypoints(tuple(record.counts["joints"]), counts, tables)
+    write_keypoints(flight.keypoints_path(detector), found)
 
 
 def _followed(session: Path) -> dict[str, Background]:
