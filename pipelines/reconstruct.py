@@ -139,7 +139,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=53)
+RECONSTRUCT = Stage("reconstruct", revision=54)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 

@@ -4,7 +4,8 @@ Landmarks are a detector's keypoints as points that are fixed to a bone (`data/l
 `tools/body_landmarks.py`). How far a landmark of one body lies from its place in the table is constant over a
 flight and unknown: such offsets are estimated with the shape, with the table's spread as prior. So shape and
 pose do not seem surer than landmarks are. Landmarks vary together: over bare legs both ankles, heels and
-knees lie higher than over trousers. The table has the principal modes of this (factor analysis).
+knees lie higher than over trousers. The table has the principal modes of this (factor analysis). Within a
+flight landmarks of a limb or a face err together, too: the modes have an amplitude at every time besides.
 
 The fit is a maximum a posteriori estimate: joints with their covariances and the spread of landmarks between
 pictures, bounded (Cauchy); a prior of the shape; and the range of every joint, as a wide normal distribution
@@ -50,10 +51,10 @@ _BLOCK = 128
 _SHAPE_STEPS, _POSE_STEPS = 12, 6
 # A landmark this many standard deviations off has half its weight.
 _CAUCHY = 3.0
+# Weights of landmarks and amplitudes of modes in turn: then neither changes.
+_AMPLITUDE_STEPS = 3
 # A joint beyond its range is held back as if by a measurement this good.
 _BOUND_RAD = np.radians(5.0)
-# A range is taken as two standard deviations to both sides of the usual posture.
-_USUAL_SHARE = 0.5
 # Who crouches or lies is far from usual in many joints: a joint beyond so many standard deviations has less
 # than half of its weight.
 _USUAL_CAUCHY = 2.0
@@ -312,6 +313,10 @@ def _apart(t_ns: Int64) -> Index:
 class Points:
     """Landmarks, and joints of the bones, as functions of pose and shared unknowns."""
 
+    # A range is taken as three standard deviations to both sides of the usual posture. On the tuning flights
+    # bodies are 1 % worse with two, and statures with four.
+    usual_share = 1 / 3
+
     def __init__(self, model: BodyModel, landmarks: Landmarks) -> None:
         """Take the reach of every point."""
         self.model, self.bone = model, landmarks.bone
@@ -319,6 +324,7 @@ class Points:
         every = np.arange(len(BONES))
         self.centres = model.reach(every, np.zeros((len(BONES), 3)))
         self.prior = shared_prior(landmarks)
+        self.together = landmarks.modes
 
     def vectors(self, shared: Shared) -> Float:
         """Return the vectors u [K, 22, 3] of the landmarks, relative to the stature."""
@@ -328,22 +334,22 @@ class Points:
 
     def _whitened(
         self, poses: Poses, seen: Places | Rays, shared: Shared
-    ) -> tuple[Float, Float, Float, Float, Float]:
-        """Return arms R_b u_b [N, K, 22, 3], bounded weights, errors, cost [N] and slopes by poses."""
+    ) -> tuple[Float, Float, Float, Float, Float, Float]:
+        """Return arms R_b u_b [N, K, 22, 3], weights, errors, cost [N], slopes by poses; see `_bounded`."""
         stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
         arms = np.einsum("nbij,kbj->nkbi", poses.turn, self.vectors(shared), optimize=True)
         points = poses.root[:, None] + stature * arms.sum(axis=2)
         seen = seen.near(points)
         white = np.einsum("nkij,nkj->nki", seen.root_weight, seen.place - points)
-        square = np.sum(white**2, axis=-1)
-        bounded = 1 / np.sqrt(1 + square / _CAUCHY**2)[..., None]
+        modes = stature * (seen.root_weight @ poses.turn[:, self.bone]) @ self.together
+        bounded, cost, shift = _bounded(white, modes)
         root = seen.root_weight * bounded[..., None]
         slope = np.empty((count, many, 3, 1 + len(BONES), 3))
         slope[:, :, :, 0] = root
         crossed = -stature * cross_matrix(arms)  # [N, K, 22, 3, 3]
         slope[:, :, :, 1:] = np.einsum("nkij,nkbjl->nkibl", root, crossed, optimize=True)
-        cost = _CAUCHY**2 * np.log1p(square / _CAUCHY**2).sum(axis=1)
-        return arms, root, white * bounded, cost, slope.reshape(count, 3 * many, -1)
+        error = _less(shift, (white * bounded).reshape(count, -1, 1))[..., 0]
+        return arms, root, error, cost, _less(shift, slope.reshape(count, 3 * many, -1)), shift
 
     def costs(self, poses: Poses, seen: Places | Rays, shared: Shared) -> Float:
         """Compute the cost [N] of each moment's landmarks."""
@@ -354,10 +360,10 @@ class Points:
     ) -> Normal:
         """Build the normal equations, with a `share` of the usual posture; of shared unknowns if `whole`."""
         stature, count, many = shared.shape[0], len(poses.root), len(self.bone)
-        arms, root, errors, cost, slope = self._whitened(poses, seen, shared)
-        transposed, white = np.swapaxes(slope, 1, 2), errors.reshape(count, -1)
+        arms, root, white, cost, slope, shift = self._whitened(poses, seen, shared)
+        transposed = np.swapaxes(slope, 1, 2)
         pose, right = transposed @ slope, (transposed @ white[..., None])[..., 0]
-        cost = cost + _add_ranges(poses.turn, pose, right, share)
+        cost = cost + _add_ranges(poses.turn, pose, right, share, self.usual_share * joint_ranges().half)
         if not whole:
             empty = np.zeros((0, 0))
             return Normal(cost, pose, right, empty, empty, empty)
@@ -371,7 +377,7 @@ class Points:
         by_shared[..., :12] = by_shape
         for k in range(many):
             by_shared[:, k, :, 12 + 3 * k : 15 + 3 * k] = by_offset[:, k]
-        shares = by_shared.reshape(count, 3 * many, -1)
+        shares = _less(shift, by_shared.reshape(count, 3 * many, -1))
         flat = shares.reshape(-1, shares.shape[-1])
         return Normal(
             cost,
@@ -406,6 +412,35 @@ class Points:
             place,
             _spread(slope, by_shared, covariance, shared_covariance),
         )
+
+
+def _bounded(white: Float, modes: Float) -> tuple[Float, Float, Float]:
+    """Bound whitened errors [N, K, 3] of landmarks (Cauchy) that modes [N, K, 3, M] move together.
+
+    Return roots of weights [N, K, 1], the cost [N] with the best amplitudes (variance 1), and L [N, 3 K, M]:
+    1 - L L^T is the root of the inverse of 1 + G G^T, the covariance of weighted errors with modes G.
+    """
+    count, landmarks, _, many = modes.shape
+    flat, left = modes.reshape(count, 3 * landmarks, many), white
+    for _ in range(_AMPLITUDE_STEPS):
+        weight = 1 / (1 + np.sum(left**2, axis=-1, keepdims=True) / _CAUCHY**2)
+        weighted = np.swapaxes((modes * weight[..., None]).reshape(flat.shape), 1, 2)
+        amplitude = np.linalg.solve(weighted @ flat + np.eye(many), weighted @ white.reshape(count, -1, 1))
+        left = white - (flat @ amplitude).reshape(white.shape)
+    square = np.sum(left**2, axis=-1, keepdims=True) / _CAUCHY**2
+    cost = _CAUCHY**2 * np.log1p(square).sum(axis=(1, 2)) + np.sum(amplitude**2, axis=(1, 2))
+    bounded = 1 / np.sqrt(1 + square)
+    flat = (modes * bounded[..., None]).reshape(flat.shape)
+    size, axes = np.linalg.eigh(np.swapaxes(flat, 1, 2) @ flat)
+    size = np.maximum(size, 1e-12)
+    shift = flat @ (axes * np.sqrt((1 - 1 / np.sqrt(1 + size)) / size)[:, None])
+    return bounded, cost, np.asarray(shift, np.float64)
+
+
+def _less(shift: Float, columns: Float) -> Float:
+    """Multiply columns [N, 3 K, C] by 1 - L L^T, see `_bounded`."""
+    found: Float = columns - shift @ (np.swapaxes(shift, 1, 2) @ columns)
+    return found
 
 
 def _slopes(
@@ -451,7 +486,7 @@ class JointRanges:
     parent: Index  # [21]
     middle: Float  # [21, 3, 3] parent from middle
     usual: Float  # [21, 3] posture
-    sigma: Float  # [21, 3] of its spread
+    half: Float  # [21, 3] of the range
     low: Float  # [21, 3]
     high: Float  # [21, 3]
 
@@ -472,12 +507,12 @@ def joint_ranges() -> JointRanges:
         turn = matrix_from_quaternion(quaternion_from_rotation_vector(middle))
         usual = -middle + [0.0, np.radians(_USUAL_ELBOW_DEG) * (part == "forearm"), 0.0]
         limits = low - middle, high - middle
-        rows.append((BONE[name], BONE[parent], turn, usual, _USUAL_SHARE * half, *limits))
+        rows.append((BONE[name], BONE[parent], turn, usual, half, *limits))
     return JointRanges(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def _add_ranges(turn: Float, pose: Float, right: Float, share: float) -> Float:
-    """Add the ranges of joints to normal equations, in place; return their cost [N]."""
+def _add_ranges(turn: Float, pose: Float, right: Float, share: float, sigma: Float) -> Float:
+    """Add the ranges and usual spread of joints to normal equations, in place; return their cost [N]."""
     usual = joint_ranges()
     bones, parents, low, high = usual.bone, usual.parent, usual.low, usual.high
     frame = turn[:, parents] @ usual.middle  # world from the middle
@@ -487,8 +522,8 @@ def _add_ranges(turn: Float, pose: Float, right: Float, share: float) -> Float:
     beyond = np.where(vector < low, vector - low, np.where(vector > high, vector - high, 0.0))
     steep = np.where(beyond == 0.0, 0.0, _BOUND_RAD**-2)
     away = vector - usual.usual
-    square = np.sum((away / usual.sigma) ** 2, axis=-1, keepdims=True) / _USUAL_CAUCHY**2
-    weight = share * usual.sigma**-2 / (1 + square)
+    square = np.sum((away / sigma) ** 2, axis=-1, keepdims=True) / _USUAL_CAUCHY**2
+    weight = share * sigma**-2 / (1 + square)
     bound = np.sum(steep * beyond**2, axis=(1, 2))
     cost = share * _USUAL_CAUCHY**2 * np.log1p(square).sum(axis=(1, 2)) + bound
 

@@ -53,7 +53,7 @@ def moving(rng: np.random.Generator) -> tuple[Poses, Float]:
     turn = np.zeros((TIMES, len(BONES), 3, 3))
     turn[:, 0] = matrix_from_quaternion(quaternion_from_rotation_vector(np.hstack([0.1 * t_s, 0 * t_s, t_s])))
     for k, (bone, parent) in enumerate(zip(ranges.bone, ranges.parent, strict=True)):
-        vector = ranges.usual[k] + 0.2 * ranges.sigma[k] * np.sin(2 * t_s + rng.uniform(0, 6.28, 3))
+        vector = ranges.usual[k] + 0.1 * ranges.half[k] * np.sin(2 * t_s + rng.uniform(0, 6.28, 3))
         relative = matrix_from_quaternion(quaternion_from_rotation_vector(vector))
         turn[:, bone] = turn[:, parent] @ ranges.middle[k] @ relative
     root = np.hstack([t_s, 0 * t_s, 0 * t_s + 1.0])
