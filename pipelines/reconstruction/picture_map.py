@@ -300,8 +300,9 @@ def map_pictures(
     A map of a film that its own sightings contradict begins anew on a plane, and the better one counts.
     """
     found = _mapped(features, intrinsics, refine_focal=refine_focal)
-    if len(features[0].point) and far_share(found, intrinsics) > FAR_SHARE_TO_MAP_AGAIN:
-        with suppress(NoAttitudesError):
+    film = any(len(each.point) for each in features)
+    if film and far_share(found, intrinsics) > FAR_SHARE_TO_MAP_AGAIN:
+        with suppress(NoAttitudesError, np.linalg.LinAlgError):
             again = _mapped_above_plane(features, intrinsics)
             found = min(found, again, key=partial(far_share, intrinsics=intrinsics))
     return found
@@ -480,7 +481,7 @@ def _chain_above_plane(
             u, _, vt = np.linalg.svd(np.column_stack([view[:, :2], np.cross(view[:, 0], view[:, 1])]))
             turn[k] = (u @ vt).T
             at[k] = -turn[k] @ view[:, 2]
-            if at[k, 2] <= 0:
+            if not at[k, 2] > 0:
                 return at, turn, np.inf
             seen = (np.insert(there, 2, 0.0, axis=1) - at[k]) @ turn[k]
             errors.append(focal_px * np.linalg.norm(seen[:, :2] / seen[:, 2:] - own.xy[known], axis=1))
