@@ -109,14 +109,12 @@ def measured(flight: Flight) -> Iterator[tuple[str, BodyErrors]]:
             session = drawn.session(Path(folder) / str(number), 0, "model", detector, poses=poses)
             with kept_in_place_of_pictures(flight, detector):
                 reconstruct(session, ReconstructSettings(method=method, detector=detector))  # type: ignore[arg-type]
-            for errors in errors_of(session):
-                yield case, errors
+            yield from ((case, errors) for errors in errors_of(session))
         people = drawn.simulated.people
         if len(people) == 1:
             with kept_in_place_of_pictures(flight, detector), _shape_held(people[0].look.body):
                 reconstruct(session, ReconstructSettings(detector=detector), force=True)
-            for errors in errors_of(session):
-                yield TRUE_SHAPE, errors
+            yield from ((TRUE_SHAPE, errors) for errors in errors_of(session))
         height = drawn.simulated.world.height
         level = GroundHeight(lambda places: height(places[:, :2]), _GROUND_SIGMA_M)
         known = patch("pipelines.reconstruction.bodies._height_of", lambda *_: level)
@@ -130,8 +128,7 @@ def measured(flight: Flight) -> Iterator[tuple[str, BodyErrors]]:
                 session = ingest(place / f"{drone}.yaml", place / f"only_{drone}").folder
                 with kept_in_place_of_pictures(flight, "blazepose"), known if ground_known else nullcontext():
                     reconstruct(session, ReconstructSettings())
-                for errors in errors_of(session):
-                    yield case, errors
+                yield from ((case, errors) for errors in errors_of(session))
 
 
 @contextmanager
@@ -198,8 +195,7 @@ def _about_hips(joints: Float) -> Float:
     """Subtract the middle of the hips from joints [T, J, 3] in the order of `CENTRES`."""
     names = list(CENTRES)
     hips = joints[:, [names.index("left_hip"), names.index("right_hip")]]
-    relative: Float = joints - hips.mean(axis=1, keepdims=True)
-    return relative
+    return np.asarray(joints - hips.mean(axis=1, keepdims=True))
 
 
 def _surface_errors(
