@@ -93,7 +93,16 @@ def step(system: System, at: Eliminated) -> State:
     if count:
         knots[interval : interval + 2] = alive[2 * n : 2 * n + 2 * count].reshape(2, count)
     for first, last, factors in _factors_backwards(system, at):
-        interval = backwards(first, last, system.of_time, interval, factors, position, knots, shared)
+        for begin, stop, knot in _backwards(system, first, last, interval, factors.first_interval):
+            if stop is None:
+                interval, row = knot, knot - factors.first_interval
+                z = np.concatenate([position[begin + 1 : begin + 3].ravel(), knots[knot + 1], shared])
+                rest = factors.knot_solved[row] - z @ factors.knot_across[row]
+                knots[knot] = rest @ factors.knot_inverse[row]
+            else:
+                z = np.concatenate([np.zeros(2 * n), knots[knot : knot + 2].ravel(), shared])
+                own = (each[begin - first : stop - first] for each in factors[1:4])
+                backwards(position[begin : stop + 2], z, *own)
     moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
     kernels.whiten(system.equations(state), moved)
     return moved
@@ -201,13 +210,78 @@ def _eliminate(system: System, state: State, front: _Front, first: int, last: in
         np.zeros((knots, size - n - c, c)),
         np.zeros((knots, c)),
     )
+    sweep = _sweep(system, state)
+    if c and first == 0:
+        _tie_knots(front, sweep, n)
     try:
-        front.interval = forwards(
-            first, last, _sweep(system, state), front.matrix, front.gradient, front.interval, factors
-        )
+        begin = first
+        while True:
+            while c and front.interval < system.of_time[begin]:
+                _eliminate_knot(
+                    front, n, c, *(e[front.interval - factors.first_interval] for e in factors[4:])
+                )
+                front.interval += 1
+                _tie_knots(front, sweep, n)
+            if begin == last:
+                return factors
+            stop = min(last, int(np.searchsorted(system.of_time, front.interval, "right"))) if c else last
+            own = (each[begin - first : stop - first] for each in factors[1:4])
+            forwards(begin, sweep, front.matrix, front.gradient, *own)
+            begin = stop
     except np.linalg.LinAlgError as error:
         raise np.linalg.LinAlgError("the equations of the refinement are singular") from error
-    return factors
+
+
+def _eliminate_knot(front: _Front, n: int, c: int, inverse: Float, across: Float, solved: Float) -> None:
+    """Eliminate the knot before; the knot after takes its place, and the next enters without information."""
+    from scipy.linalg.lapack import dtrtri
+
+    matrix, gradient = front.matrix, front.gradient
+    before, after, end = slice(3 * n, 3 * n + c), slice(3 * n + c, 3 * n + 2 * c), 3 * n + 2 * c
+    rest = np.r_[: 2 * n, 3 * n + c : len(gradient)]  # joints at the third time have no information yet
+    beside = np.concatenate([matrix[before, : 2 * n].T, matrix[after.start :, before]])
+    inverse[:] = dtrtri(np.linalg.cholesky(matrix[before, before]), lower=1)[0]
+    across[:] = beside @ inverse.T
+    solved[:] = -inverse @ gradient[before]
+    matrix[np.ix_(rest, rest)] -= across @ across.T
+    gradient[rest] += across @ solved
+    matrix[before, : 3 * n], matrix[before, before] = matrix[after, : 3 * n], matrix[after, after]
+    matrix[end:, before], gradient[before] = matrix[end:, after], gradient[after]
+    matrix[after, :end], matrix[end:, after], gradient[after] = 0.0, 0.0, 0.0
+
+
+def _tie_knots(front: _Front, sweep: Sweep, n: int) -> None:
+    """Add the prior of the change between the knot before and the knot after."""
+    knots, interval = sweep.equations.state.knots, front.interval
+    kept, q = sweep.tie_kept[interval], sweep.tie_variance[interval]
+    change = knots[interval + 1] - kept * knots[interval]
+    before = 3 * n + np.arange(len(q))
+    after = before + len(q)
+    front.matrix[before, before] += kept**2 / q
+    front.matrix[after, after] += 1 / q
+    front.matrix[after, before] -= kept / q
+    front.gradient[before] -= kept * change / q
+    front.gradient[after] += change / q
+
+
+def _backwards(
+    system: System, first: int, last: int, interval: int, least: int
+) -> Iterator[tuple[int, int | None, int]]:
+    """Yield a segment from its end: stretches [first, last) between two knots, and each knot's elimination.
+
+    A stretch has the knot before it. A knot has no last time, and first is the time before it was eliminated;
+    those from `least` come before the segment.
+    """
+    knots, stop = system.layout.entries.knot_count > 0, last
+    while True:
+        while knots and interval > (system.of_time[stop - 1] if stop > first else least):
+            interval -= 1
+            yield stop - 1, None, interval
+        if stop == first:
+            return
+        begin = max(first, int(np.searchsorted(system.of_time, interval))) if knots else first
+        yield begin, stop, interval
+        stop = begin
 
 
 def _last_covariance(at: Eliminated) -> Float:
@@ -240,9 +314,48 @@ def _visit(system: System, state: State, at: Eliminated, covariance: Float, ever
         len(problem.t_s) - 2,
     )
     others, interval, sweep = _last_covariance(at), int(system.of_time[-1]), _sweep(system, state)
+    n, walks = 3 * joints, bool(knot_count and every)
+    if walks:
+        _add_walk(others, n, sweep, interval, found.walked)
     for first, last, factors in _factors_backwards(system, at):
-        others, interval = visit(first, last, sweep, others, interval, factors, every, covariance, found)
+        for begin, stop, knot in _backwards(system, first, last, interval, factors.first_interval):
+            if stop is None:
+                interval, row = knot, knot - factors.first_interval
+                others = _before_knot(others, n, factors.knot_inverse[row], factors.knot_across[row])
+                if walks:
+                    _add_walk(others, n, sweep, interval, found.walked)
+            else:
+                rows = slice(begin - first, stop - first)
+                inverse, across = factors.inverse[rows], factors.across[rows]
+                others = visit(begin, sweep, others, inverse, across, every, covariance, found)
     return found
+
+
+def _before_knot(alive: Float, n: int, inverse: Float, across: Float) -> Float:
+    """Compute the covariance of the unknowns alive before the elimination of a knot."""
+    c = len(inverse)
+    then = np.r_[: 2 * n + c, 2 * n + 2 * c : len(alive)]  # all but the knot after the next
+    place, knot = then + c * (then >= 2 * n) * (then < 2 * n + c), slice(2 * n, 2 * n + c)
+    beside = alive[np.ix_(then, then)]
+    gain = across @ inverse
+    cross = beside @ gain
+    own = inverse.T @ inverse + (gain.T @ cross + cross.T @ gain) / 2
+    joined = np.empty_like(alive)
+    joined[np.ix_(place, place)], joined[knot, knot] = beside, own
+    joined[place, knot], joined[knot, place] = -cross, -cross.T
+    return joined
+
+
+def _add_walk(alive: Float, n: int, sweep: Sweep, interval: int, walked: Float) -> None:
+    """Add the change of the slow errors between two knots, per second."""
+    knots, c = sweep.equations.state.knots, len(walked)
+    elapsed = sweep.knot_t_s[interval + 1] - sweep.knot_t_s[interval]
+    before = 2 * n + np.arange(c)
+    after = before + c
+    variance = (alive[before, before] + alive[after, after] - 2 * alive[before, after]) / elapsed
+    walked[:, 0] += (knots[interval + 1] - knots[interval]) ** 2 / elapsed + variance
+    walked[:, 1] += 1
+    walked[:, 2] += variance
 
 
 # --- compiled --------------------------------------------------------------------------------------------
@@ -345,35 +458,17 @@ def eliminate_block(
 
 @cached
 def forwards(
-    first: int, last: int, sweep: Sweep, front: Float, gradient: Float, interval: int, factors: Factors
-) -> int:
-    """Eliminate the times from `first` to before `last`; return the last's interval."""
+    first: int, sweep: Sweep, front: Float, gradient: Float, inverse: Float, across: Float, solved: Float
+) -> None:
+    """Eliminate the times from `first` that are between the same two knots; fill their factors."""
     position, shared = sweep.equations.state.position, sweep.equations.state.shared
-    knots, bones = sweep.equations.state.knots, sweep.bones
-    starts, of_time, grown = sweep.starts, sweep.of_time, sweep.grown
-    inverse, across, solved = factors.inverse, factors.across, factors.solved
-    J = position.shape[1]
-    n, c = 3 * J, sweep.equations.entries.knot_count
-    size = len(gradient)
-    s = size - 3 * n - 2 * c
+    bones, starts, grown = sweep.bones, sweep.starts, sweep.grown
+    n, size = inverse.shape[1], len(gradient)
     lengths = shared[len(shared) - len(bones) :]
     length_offset = size - len(bones)
-    kept, variance = sweep.tie_kept, sweep.tie_variance
-    if c and first == 0:
-        tie_knots(front, gradient, n, c, knots, interval, kept, variance)
     own, beside = np.empty((n, n)), np.empty((size - n, n))
-    knot_own, knot_beside = np.empty((c, c)), np.empty((2 * n + c + s, c))
-    for time in range(first, last + 1):
-        while c and interval < of_time[time]:
-            k = interval - factors.first_interval
-            eliminate_knot(
-                front, gradient, n, c, knot_own, knot_beside, factors.knot_inverse[k],
-                factors.knot_across[k], factors.knot_solved[k],
-            )  # fmt: skip
-            interval += 1
-            tie_knots(front, gradient, n, c, knots, interval, kept, variance)
-        if time == last:
-            break
+    for row in range(len(inverse)):
+        time = first + row
         assemble(starts[time], starts[time + 1], sweep.equations, front, gradient)
         add_motion(
             position[time : time + 3], sweep.curvature[time], sweep.precision,
@@ -387,7 +482,6 @@ def forwards(
             )  # fmt: skip
         copy_block(front, 0, 0, own)
         copy_block(front, n, 0, beside)
-        row = time - first
         w = across[row]
         less = eliminate_block(own, beside, gradient[:n], inverse[row], w, solved[row])
         # The joints at the next two times move up; those of a third enter without any information.
@@ -413,155 +507,29 @@ def forwards(
                 front[i, j] = 0.0
             for j in range(3 * n, i + 1):
                 front[i, j] -= less[i - n, j - n]
-    return interval
-
-
-@helper
-def eliminate_knot(
-    front: Float,
-    gradient: Float,
-    n: int,
-    c: int,
-    own: Float,
-    beside: Float,
-    inverse: Float,
-    across: Float,
-    solved: Float,
-) -> None:
-    """Eliminate the knot before; the knot after takes its place, and the next enters without information."""
-    size = len(gradient)
-    before, after = 3 * n, 3 * n + c
-    copy_block(front, before, before, own)
-    for i in range(c):
-        for j in range(2 * n):
-            beside[j, i] = front[before + i, j]
-        for j in range(after, size):
-            beside[2 * n + j - after, i] = front[j, before + i]
-    less = eliminate_block(own, beside, gradient[before:after], inverse, across, solved)
-    for i in range(2 * n):
-        for a in range(c):
-            gradient[i] += across[i, a] * solved[a]
-        for j in range(i + 1):
-            front[i, j] -= less[i, j]
-    for i in range(after, size):
-        row = 2 * n + i - after
-        down = 0.0
-        for a in range(c):
-            down += across[row, a] * solved[a]
-        gradient[i] += down
-        for j in range(2 * n):
-            front[i, j] -= less[row, j]
-        for j in range(after, i + 1):
-            front[i, j] -= less[row, 2 * n + j - after]
-    for i in range(c):
-        gradient[before + i] = gradient[after + i]
-        gradient[after + i] = 0.0
-        for j in range(3 * n):
-            front[before + i, j] = front[after + i, j]
-            front[after + i, j] = 0.0
-        for j in range(i + 1):
-            front[before + i, before + j] = front[after + i, after + j]
-        for j in range(c):
-            front[after + i, before + j] = 0.0
-        for j in range(i + 1):
-            front[after + i, after + j] = 0.0
-    for i in range(after + c, size):
-        for j in range(c):
-            front[i, before + j] = front[i, after + j]
-            front[i, after + j] = 0.0
-
-
-@helper
-def tie_knots(
-    front: Float,
-    gradient: Float,
-    n: int,
-    c: int,
-    knots: Float,
-    interval: int,
-    tie_kept: Float,
-    tie_variance: Float,
-) -> None:
-    """Add the prior of the change between the knot before and the knot after."""
-    before, after = 3 * n, 3 * n + c
-    for i in range(c):
-        kept, q = tie_kept[interval, i], tie_variance[interval, i]
-        change = knots[interval + 1, i] - kept * knots[interval, i]
-        front[before + i, before + i] += kept * kept / q
-        front[after + i, after + i] += 1 / q
-        front[after + i, before + i] -= kept / q
-        gradient[before + i] -= kept * change / q
-        gradient[after + i] += change / q
 
 
 @cached
-def backwards(
-    first: int,
-    last: int,
-    of_time: Int64,
-    interval: int,
-    factors: Factors,
-    position: Float,
-    knots: Float,
-    shared: Float,
-) -> int:
-    """Solve for joints [T, n] and knots [K, c] of a stretch from its end, in place; return the interval."""
-    inverse, across, solved = factors.inverse, factors.across, factors.solved
-    n, c = position.shape[1], knots.shape[1]
-    s = len(shared)
-    z, zk = np.empty(2 * n + 2 * c + s), np.empty(2 * n + c + s)
-    for i in range(s):
-        z[2 * n + 2 * c + i] = shared[i]
-        zk[2 * n + c + i] = shared[i]
-    rest_n, rest_c = np.empty(n), np.empty(c)
-    for time in range(last - 1, first - 2, -1):
-        # Solve knots eliminated after this time first; at the end, those before the stretch.
-        while c and interval > (of_time[time] if time >= first else factors.first_interval):
-            interval -= 1
-            follow_knot(time, interval, zk, rest_c, factors, position, knots)
-        if time < first:
-            break
-        row = time - first
+def backwards(position: Float, z: Float, inverse: Float, across: Float, solved: Float) -> None:
+    """Solve for joints [K + 2, n] between the same two knots from the last two, in place.
+
+    `z` has the knots and the shared unknowns behind room for joints at two times.
+    """
+    n = position.shape[1]
+    rest = np.empty(n)
+    for row in range(len(inverse) - 1, -1, -1):
         for i in range(n):
-            z[i] = position[time + 1, i]
-            z[n + i] = position[time + 2, i]
-            rest_n[i] = solved[row, i]
-        for i in range(c):
-            z[2 * n + i] = knots[interval, i]
-            z[2 * n + c + i] = knots[interval + 1, i]
+            z[i] = position[row + 1, i]
+            z[n + i] = position[row + 2, i]
+            rest[i] = solved[row, i]
         for j in range(len(z)):
             for i in range(n):
-                rest_n[i] -= across[row, j, i] * z[j]
+                rest[i] -= across[row, j, i] * z[j]
         for i in range(n):
-            position[time, i] = 0.0
+            position[row, i] = 0.0
         for j in range(n):
             for i in range(j + 1):
-                position[time, i] += inverse[row, j, i] * rest_n[j]
-    return interval
-
-
-@helper
-def follow_knot(
-    time: int, interval: int, z: Float, rest: Float, factors: Factors, position: Float, knots: Float
-) -> None:
-    """Solve for a knot from the next knot and the joints at `time` + 1 and `time` + 2."""
-    n, c = position.shape[1], knots.shape[1]
-    row = interval - factors.first_interval
-    inverse, across, solved = factors.knot_inverse, factors.knot_across, factors.knot_solved
-    for i in range(n):
-        z[i] = position[time + 1, i]
-        z[n + i] = position[time + 2, i]
-    for i in range(c):
-        z[2 * n + i] = knots[interval + 1, i]
-        rest[i] = solved[row, i]
-    for j in range(len(z)):
-        for i in range(c):
-            rest[i] -= across[row, j, i] * z[j]
-    for i in range(c):
-        knots[interval, i] = 0.0
-    for j in range(c):
-        for i in range(j + 1):
-            knots[interval, i] += inverse[row, j, i] * rest[j]
+                position[row, i] += inverse[row, j, i] * rest[j]
 
 
 # --- covariances ---------------------------------------------------------------------------------------
@@ -584,25 +552,22 @@ def join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
 @cached
 def visit(
     first: int,
-    last: int,
     sweep: Sweep,
     others: Float,
-    interval: int,
-    factors: Factors,
+    inverse: Float,
+    across: Float,
     every: int,
     covariance: Float,
     sums: Moments,
-) -> tuple[Float, int]:
-    """Compute covariances of a stretch from its end, and sums for the levels.
+) -> Float:
+    """Compute covariances of the times from `first` between the same two knots, and sums for the levels.
 
     `others` [m, m] is the covariance of the unknowns alive at the end. `covariance` [T, J, 3, 3] is filled
     unless empty. Sums are made unless `every` is 0, over the
-    pictures of every `every`-th time. Returns the covariance of the unknowns alive at the beginning, and the
-    interval there.
+    pictures of every `every`-th time. Returns the covariance of the unknowns alive at the beginning.
     """
-    equations, starts, of_time = sweep.equations, sweep.starts, sweep.of_time
+    equations, starts, starting = sweep.equations, sweep.starts, sums.starting
     knots, shared, white = equations.state.knots, equations.state.shared, equations.state.white
-    inverse, across, starting = factors.inverse, factors.across, sums.starting
     J = equations.state.position.shape[1]
     n, c = 3 * J, equations.entries.knot_count
     m = len(others)
@@ -614,19 +579,8 @@ def visit(
         np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS)), np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
     )
     last_time = len(equations.t_s) - 3
-    if c and every and last == last_time + 1:
-        walk_of(alive, n, c, knots, sweep.knot_t_s, interval, sums.walked)
-    for time in range(last - 1, first - 2, -1):
-        # As in the forward pass; at the end, the knots before the stretch.
-        while c and interval > (of_time[time] if time >= first else factors.first_interval):
-            interval -= 1
-            row = interval - factors.first_interval
-            alive = before_knot(alive, n, c, factors.knot_inverse[row], factors.knot_across[row])
-            if every:
-                walk_of(alive, n, c, knots, sweep.knot_t_s, interval, sums.walked)
-        if time < first:
-            break
-        row = time - first
+    for row in range(len(inverse) - 1, -1, -1):
+        time = first + row
         own, cross = join(inverse[row], across[row], alive)
         for i in range(n):
             for j in range(n):
@@ -655,9 +609,9 @@ def visit(
                 for g in range(starts[time], starts[time + 1]):
                     posterior_of_picture(g, equations, whole, picture, posterior)
                     noise_of(picture, posterior, sums.image)
-                    row = equations.pictures.white_row[g]
-                    if row == equations.pictures.camera[g]:  # others have their own precision, not the level
-                        precision = equations.white_precision[row]
+                    of_white = equations.pictures.white_row[g]
+                    if of_white == equations.pictures.camera[g]:  # others have their own, not the level
+                        precision = equations.white_precision[of_white]
                         white_of(white[g], precision, posterior.of_white, sums.white)
             if time == 0:
                 for i in range(c):
@@ -674,51 +628,7 @@ def visit(
                 alive[i, j] = whole[below, j]
             for j in range(2 * n, m):
                 alive[i, j] = whole[below, n + j]
-    return alive, interval
-
-
-@helper
-def before_knot(alive: Float, n: int, c: int, inverse: Float, across: Float) -> Float:
-    """Compute the covariance of the unknowns alive before the elimination of a knot."""
-    m = len(alive)
-    place = np.empty(m - c, np.int64)  # those alive then: all but the knot after the next
-    for i in range(2 * n + c):
-        place[i] = i
-    for i in range(2 * n + 2 * c, m):
-        place[i - c] = i
-    beside = np.empty((m - c, m - c))
-    for i in range(m - c):
-        for j in range(m - c):
-            beside[i, j] = alive[place[i], place[j]]
-    own, cross = join(inverse, across, beside)
-    for i in range(2 * n, 2 * n + c):  # the knot before becomes the knot after
-        place[i] += c
-    joined = np.empty((m, m))
-    for i in range(m - c):
-        for j in range(m - c):
-            joined[place[i], place[j]] = beside[i, j]
-        for j in range(c):
-            joined[place[i], 2 * n + j] = -cross[i, j]
-            joined[2 * n + j, place[i]] = -cross[i, j]
-    for i in range(c):
-        for j in range(c):
-            joined[2 * n + i, 2 * n + j] = own[i, j]
-    return joined
-
-
-@helper
-def walk_of(
-    alive: Float, n: int, c: int, knots: Float, knot_t_s: Float, interval: int, walked: Float
-) -> None:
-    """Add the change of the slow errors between two knots, per second."""
-    elapsed = knot_t_s[interval + 1] - knot_t_s[interval]
-    for i in range(c):
-        p, q = 2 * n + i, 2 * n + c + i
-        variance = (alive[p, p] + alive[q, q] - 2 * alive[p, q]) / elapsed
-        change = knots[interval + 1, i] - knots[interval, i]
-        walked[i, 0] += change**2 / elapsed + variance
-        walked[i, 1] += 1
-        walked[i, 2] += variance
+    return alive
 
 
 @helper
