@@ -101,8 +101,10 @@ def step(system: System, at: Eliminated) -> State:
                 knots[knot] = rest @ factors.knot_inverse[row]
             else:
                 z = np.concatenate([np.zeros(2 * n), knots[knot : knot + 2].ravel(), shared])
-                own = (each[begin - first : stop - first] for each in factors[1:4])
-                backwards(position[begin : stop + 2], z, *own)
+                for time in range(stop - 1, begin - 1, -1):
+                    row = time - first
+                    z[: 2 * n] = position[time + 1 : time + 3].ravel()
+                    position[time] = (factors.solved[row] - z @ factors.across[row]) @ factors.inverse[row]
     moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
     kernels.whiten(system.equations(state), moved)
     return moved
@@ -314,7 +316,8 @@ def _visit(system: System, state: State, at: Eliminated, covariance: Float, ever
         len(problem.t_s) - 2,
     )
     others, interval, sweep = _last_covariance(at), int(system.of_time[-1]), _sweep(system, state)
-    n, walks = 3 * joints, bool(knot_count and every)
+    n, size, walks = 3 * joints, system.size, bool(knot_count and every)
+    whole = np.empty((size, size))
     if walks:
         _add_walk(others, n, sweep, interval, found.walked)
     for first, last, factors in _factors_backwards(system, at):
@@ -325,10 +328,43 @@ def _visit(system: System, state: State, at: Eliminated, covariance: Float, ever
                 if walks:
                     _add_walk(others, n, sweep, interval, found.walked)
             else:
-                rows = slice(begin - first, stop - first)
-                inverse, across = factors.inverse[rows], factors.across[rows]
-                others = visit(begin, sweep, others, inverse, across, every, covariance, found)
+                for time in range(stop - 1, begin - 1, -1):
+                    others = _before_time(
+                        others, n, factors.inverse[time - first], factors.across[time - first], whole
+                    )
+                    for k in range(3 if time == len(problem.t_s) - 3 else 1) if len(covariance) else ():
+                        own = whole[k * n : k * n + n, k * n : k * n + n].reshape(joints, 3, joints, 3)
+                        covariance[time + k] = np.einsum("jajb->jab", own)
+                    if every:
+                        add_moments(time, every, sweep, whole, found)
+    if every:
+        first_value = np.concatenate([state.knots[0], state.shared])
+        variance = np.delete(np.diagonal(whole)[3 * n :], np.s_[knot_count : 2 * knot_count])
+        found.starting[:] = np.stack([first_value**2 + variance, variance], axis=1)
     return found
+
+
+def _join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
+    """Compute the covariance of eliminated unknowns, and (negated) with the others, from the others'."""
+    gain = across @ inverse  # [m, n]; x depends on the others by its negative, transposed
+    cross = others @ gain  # [m, n], negative
+    more = gain.T @ cross
+    # Symmetrise, because asymmetric rounding errors would grow from step to step.
+    return inverse.T @ inverse + (more + more.T) / 2, cross
+
+
+def _before_time(alive: Float, n: int, inverse: Float, across: Float, whole: Float) -> Float:
+    """Compute the covariance of the unknowns alive before a time; fill that with its joints, `whole`."""
+    whole[:n, :n], cross = _join(inverse, across, alive)
+    np.negative(cross, out=whole[n:, :n])
+    whole[:n, n:], whole[n:, n:] = whole[n:, :n].T, alive
+    before = np.empty_like(alive)
+    # The third of the joints' times was not alive before.
+    halves = (slice(2 * n), slice(2 * n)), (slice(2 * n, None), slice(3 * n, None))
+    for to, rows in halves:
+        for across_to, columns in halves:
+            before[to, across_to] = whole[rows, columns]
+    return before
 
 
 def _before_knot(alive: Float, n: int, inverse: Float, across: Float) -> Float:
@@ -337,9 +373,7 @@ def _before_knot(alive: Float, n: int, inverse: Float, across: Float) -> Float:
     then = np.r_[: 2 * n + c, 2 * n + 2 * c : len(alive)]  # all but the knot after the next
     place, knot = then + c * (then >= 2 * n) * (then < 2 * n + c), slice(2 * n, 2 * n + c)
     beside = alive[np.ix_(then, then)]
-    gain = across @ inverse
-    cross = beside @ gain
-    own = inverse.T @ inverse + (gain.T @ cross + cross.T @ gain) / 2
+    own, cross = _join(inverse, across, beside)
     joined = np.empty_like(alive)
     joined[np.ix_(place, place)], joined[knot, knot] = beside, own
     joined[place, knot], joined[knot, place] = -cross, -cross.T
@@ -509,126 +543,29 @@ def forwards(
                 front[i, j] -= less[i - n, j - n]
 
 
-@cached
-def backwards(position: Float, z: Float, inverse: Float, across: Float, solved: Float) -> None:
-    """Solve for joints [K + 2, n] between the same two knots from the last two, in place.
-
-    `z` has the knots and the shared unknowns behind room for joints at two times.
-    """
-    n = position.shape[1]
-    rest = np.empty(n)
-    for row in range(len(inverse) - 1, -1, -1):
-        for i in range(n):
-            z[i] = position[row + 1, i]
-            z[n + i] = position[row + 2, i]
-            rest[i] = solved[row, i]
-        for j in range(len(z)):
-            for i in range(n):
-                rest[i] -= across[row, j, i] * z[j]
-        for i in range(n):
-            position[row, i] = 0.0
-        for j in range(n):
-            for i in range(j + 1):
-                position[row, i] += inverse[row, j, i] * rest[j]
-
-
 # --- covariances ---------------------------------------------------------------------------------------
 
 
-@helper
-def join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
-    """Compute the covariance of eliminated unknowns, and (negated) with the others, from the others'."""
-    gain = np.dot(across, inverse)  # [m, n]; x depends on the others by its negative, transposed
-    cross = np.dot(others, gain)  # [m, n], negative
-    own, more = np.dot(inverse.T, inverse), np.dot(gain.T, cross)
-    # Symmetrise, because asymmetric rounding errors would grow from step to step.
-    for i in range(len(own)):
-        for j in range(i + 1):
-            own[i, j] = own[i, j] + 0.5 * (more[i, j] + more[j, i])
-            own[j, i] = own[i, j]
-    return own, cross
-
-
 @cached
-def visit(
-    first: int,
-    sweep: Sweep,
-    others: Float,
-    inverse: Float,
-    across: Float,
-    every: int,
-    covariance: Float,
-    sums: Moments,
-) -> Float:
-    """Compute covariances of the times from `first` between the same two knots, and sums for the levels.
-
-    `others` [m, m] is the covariance of the unknowns alive at the end. `covariance` [T, J, 3, 3] is filled
-    unless empty. Sums are made unless `every` is 0, over the
-    pictures of every `every`-th time. Returns the covariance of the unknowns alive at the beginning.
-    """
-    equations, starts, starting = sweep.equations, sweep.starts, sums.starting
-    knots, shared, white = equations.state.knots, equations.state.shared, equations.state.white
-    J = equations.state.position.shape[1]
-    n, c = 3 * J, equations.entries.knot_count
-    m = len(others)
-    size = m + n
-    whole = np.empty((size, size))
-    alive = others.copy()
+def add_moments(time: int, every: int, sweep: Sweep, whole: Float, sums: Moments) -> None:
+    """Add the squares at a time with the covariance `whole`, by pictures at every `every`-th time."""
+    equations, starts = sweep.equations, sweep.starts
+    position, white = equations.state.position, equations.state.white
+    J = position.shape[1]
+    acceleration_of(whole, position, sweep.curvature, sweep.spread, time, sums.acceleration)
+    bones_of(whole, position, equations.state.shared, sweep.bones, time, sums.bones)
+    if time % every != 0:
+        return
     picture = linearised(J)
     posterior = Posterior(
         np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS)), np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
     )
-    last_time = len(equations.t_s) - 3
-    for row in range(len(inverse) - 1, -1, -1):
-        time = first + row
-        own, cross = join(inverse[row], across[row], alive)
-        for i in range(n):
-            for j in range(n):
-                whole[i, j] = own[i, j]
-        for i in range(m):
-            for j in range(n):
-                whole[n + i, j] = -cross[i, j]
-                whole[j, n + i] = -cross[i, j]
-            for j in range(m):
-                whole[n + i, n + j] = alive[i, j]
-        if len(covariance):
-            for k in range(3 if time == last_time else 1):
-                for joint in range(J):
-                    p = k * n + 3 * joint
-                    for a in range(3):
-                        for b in range(3):
-                            covariance[time + k, joint, a, b] = whole[
-                                k * n + 3 * joint + a, k * n + 3 * joint + b
-                            ]
-        if every:
-            acceleration_of(
-                whole, equations.state.position, sweep.curvature, sweep.spread, time, sums.acceleration
-            )
-            bones_of(whole, equations.state.position, shared, sweep.bones, time, sums.bones)
-            if time % every == 0:
-                for g in range(starts[time], starts[time + 1]):
-                    posterior_of_picture(g, equations, whole, picture, posterior)
-                    noise_of(picture, posterior, sums.image)
-                    of_white = equations.pictures.white_row[g]
-                    if of_white == equations.pictures.camera[g]:  # others have their own, not the level
-                        precision = equations.white_precision[of_white]
-                        white_of(white[g], precision, posterior.of_white, sums.white)
-            if time == 0:
-                for i in range(c):
-                    starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]
-                    starting[i, 1] = whole[3 * n + i, 3 * n + i]
-                for i in range(len(shared)):
-                    p = 3 * n + 2 * c + i
-                    starting[c + i, 0] = shared[i] ** 2 + whole[p, p]
-                    starting[c + i, 1] = whole[p, p]
-        # The third of the joints' times was not alive before.
-        for i in range(m):
-            below = i if i < 2 * n else i + n
-            for j in range(2 * n):
-                alive[i, j] = whole[below, j]
-            for j in range(2 * n, m):
-                alive[i, j] = whole[below, n + j]
-    return alive
+    for g in range(starts[time], starts[time + 1]):
+        posterior_of_picture(g, equations, whole, picture, posterior)
+        noise_of(picture, posterior, sums.image)
+        row = equations.pictures.white_row[g]
+        if row == equations.pictures.camera[g]:  # others have their own precision, not the level
+            white_of(white[g], equations.white_precision[row], posterior.of_white, sums.white)
 
 
 @helper
