@@ -240,13 +240,16 @@ def _eliminate_knot(front: _Front, n: int, c: int, inverse: Float, across: Float
 
     matrix, gradient = front.matrix, front.gradient
     before, after, end = slice(3 * n, 3 * n + c), slice(3 * n + c, 3 * n + 2 * c), 3 * n + 2 * c
-    rest = np.r_[: 2 * n, 3 * n + c : len(gradient)]  # joints at the third time have no information yet
-    beside = np.concatenate([matrix[before, : 2 * n].T, matrix[after.start :, before]])
+    # Joints at the third time have no information yet.
+    joints, others = slice(2 * n), slice(3 * n + c, None)
+    beside = np.concatenate([matrix[before, joints].T, matrix[others, before]])
     inverse[:] = dtrtri(np.linalg.cholesky(matrix[before, before]), lower=1)[0]
     across[:] = beside @ inverse.T
     solved[:] = -inverse @ gradient[before]
-    matrix[np.ix_(rest, rest)] -= across @ across.T
-    gradient[rest] += across @ solved
+    for rows, of_rows in ((joints, joints), (others, slice(2 * n, None))):
+        matrix[rows, joints] -= across[of_rows] @ across[joints].T
+        gradient[rows] += across[of_rows] @ solved
+    matrix[others, others] -= across[2 * n :] @ across[2 * n :].T
     matrix[before, : 3 * n], matrix[before, before] = matrix[after, : 3 * n], matrix[after, after]
     matrix[end:, before], gradient[before] = matrix[end:, after], gradient[after]
     matrix[after, :end], matrix[end:, after], gradient[after] = 0.0, 0.0, 0.0
