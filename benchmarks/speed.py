@@ -121,14 +121,12 @@ def pycolmap_ransac(views: Views) -> Float:
 
 # --- several people --------------------------------------------------------------------------------------
 
-_PEOPLE, _SECONDS = 5, 30.0
-
 
 def association() -> Iterator[Row]:
     """Time the association of five people."""
-    paths = [straight((3 * np.cos(k), 3 * np.sin(k)), (-0.2 * np.cos(k), -0.1)) for k in range(_PEOPLE)]
-    scene = film(paths, seconds=_SECONDS, cameras=_PEOPLE)
-    took_ms = 1e3 * best_s(lambda: scene.associate(_PEOPLE), 3) / len(scene.time_s)  # the first compiles
+    paths = [straight((3 * np.cos(k), 3 * np.sin(k)), (-0.2 * np.cos(k), -0.1)) for k in range(5)]
+    scene = film(paths, seconds=30.0, cameras=5)
+    took_ms = 1e3 * best_s(lambda: scene.associate(5), 3) / len(scene.time_s)  # the first compiles
     said = "RapidPoseTriangulation claims 1 ms, triangulation included"
     yield "association, five people in five cameras", f"{took_ms:.2f} ms/frame", said
 
@@ -181,19 +179,18 @@ def logs() -> Iterator[Row]:
 
 # --- planner ---------------------------------------------------------------------------------------------
 
-_SIZES = ((5.0, 2), (10.0, 2), (20.0, 5))  # horizon in seconds, drones
-
 
 def planner() -> Iterator[Row]:
     """Time central plans, closed-loop flights, and the distance field of a large map."""
     field = mound(resolution_m=0.2)
-    for arm, sizes in ((ADAPTIVE, _SIZES), (JOINT, _SIZES[1:2])):
+    sizes_of = {ADAPTIVE: ((5.0, 2), (10.0, 2), (20.0, 5)), JOINT: ((10.0, 2),)}  # horizon in s, drones
+    for arm, sizes in sizes_of.items():
         for horizon_s, drones in sizes:
             config = replace(PlannerConfig(), horizon_s=horizon_s)
             knots = round(horizon_s / config.tuning.knot_s)
             plans = arm.start(config, drones=drones, yaw_rad=0.7)
-            place = {"tilt_rad": config.tilt_rad, "range_m": config.radius_m}
-            slots = formation_slots(np.array([0.7]), drones, **place)
+            tilt_rad, range_m = config.tilt_rad, config.radius_m
+            slots = formation_slots(np.array([0.7]), drones, tilt_rad=tilt_rad, range_m=range_m)
             took_ms = []
             for k in range(201):
                 walked = 0.2 * k + 1.2 * config.tuning.knot_s * np.arange(1, knots + 1)
@@ -211,9 +208,9 @@ def planner() -> Iterator[Row]:
     plan |= {"duration_s": 75, "drones": plan["drones"] | {"count": 2}}
     with simulated(plan) as manifest:
         session = ingest(manifest, manifest.parent / "one.session").folder
-        for trials in (1, 100):
+        for trials in (1, 100):  # the first run compiles
             stated = ReplanSettings(arms=("fixed", "adaptive"), trials=trials)
-            took_s = best_s(partial(replan, session, stated, force=True), 2)  # the first compiles
+            took_s = best_s(partial(replan, session, stated, force=True), 2)
             yield f"comparison of two arms, 75 s, {trials} trials", f"{took_s:.1f} s", ""
     with get_context("spawn").Pool(1) as pool:
         took_s, peak_gb = pool.apply(_field_of_hills)
@@ -228,8 +225,7 @@ def _field_of_hills() -> tuple[float, float]:
     occupancy = Occupancy(np.where(hills, np.float32(0.9), np.float32(0.1)), np.zeros(3), 0.2)
     started = time.process_time()
     assert len(distance_field(occupancy).sight)  # lines of sight are looked up beside distances
-    took_s = time.process_time() - started
-    return took_s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return time.process_time() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
 # --- pictures and commands -------------------------------------------------------------------------------
