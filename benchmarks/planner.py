@@ -311,15 +311,9 @@ def films(options: argparse.Namespace) -> Lines:
         table.append([str(seed), told[0], fixed(mean[1, 0], 1), told[1], fixed(mean[1, 1], 1)])
     header = [f"{of.replace('_', ' ')}, {figure}" for figure in FIGURES for of in KINDS[::2]]
     reasons = ", ".join(f"{number} for {reason}" for reason, number in left_out.items()) or "none"
-    hold = f"{held[0]} (mm) and {held[1]} (points) hold; left out: {reasons}."
-    rest = calibration(np.array(rows)) if len(rows) > 2 else []
-    return [
-        *markdown_table(["world", *header], table),
-        "",
-        f"Of {len(rows)} intervals (95 %), {hold}",
-        "",
-        *rest,
-    ]
+    hold = f"Of {len(rows)} intervals (95 %), {held[0]} (mm) and {held[1]} (points) hold"
+    lines = [*markdown_table(["world", *header], table), "", f"{hold}; left out: {reasons}.", ""]
+    return [*lines, *(calibration(np.array(rows)) if len(rows) > 2 else [])]
 
 
 def differences(one: Float, other: Float) -> Float:

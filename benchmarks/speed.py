@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -189,8 +190,9 @@ def planner() -> Iterator[Row]:
             config = replace(PlannerConfig(), horizon_s=horizon_s)
             knots = round(horizon_s / config.tuning.knot_s)
             plans = arm.start(config, drones=drones, yaw_rad=0.7)
-            tilt_rad, range_m = config.tilt_rad, config.radius_m
-            slots = formation_slots(np.array([0.7]), drones, tilt_rad=tilt_rad, range_m=range_m)
+            slots = formation_slots(
+                np.array([0.7]), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
+            )
             took_ms = []
             for k in range(201):
                 walked = 0.2 * k + 1.2 * config.tuning.knot_s * np.arange(1, knots + 1)
@@ -255,8 +257,7 @@ def sample() -> Iterator[Row]:
             ("ingest", str(SAMPLE / "flight.yaml"), "-o", session),
             ("reconstruct", session, "--workers", "1"),
             ("reconstruct", session, "--workers", "1", "--smooth", "butterworth"),
-            ("replan-compare", session),
-            ("report", session),
+            *((stage, session) for stage in ("replan-compare", "report")),
         ):
             kept = ", smoothed, with keypoints as they are" * ("--smooth" in options)
             peak_mb, took_s = cost_of(command, *options)
@@ -278,11 +279,10 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--only", nargs="+", choices=SUBJECTS, default=list(SUBJECTS))
     options = parser.parse_args()
-    rows = []
-    for name in options.only:
-        for row in SUBJECTS[name]():
-            print(json.dumps(row), file=sys.stderr, flush=True)
-            rows.append(list(row))
+    rows = list[list[str]]()
+    for row in chain.from_iterable(SUBJECTS[name]() for name in options.only):
+        print(json.dumps(row), file=sys.stderr, flush=True)
+        rows.append(list(row))
     lines = markdown_table(["what", "speed", "result, or compared with"], rows)
     load = f"Load of the machine: {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores."
     show("speed", [*lines, "", load], write=options.write)
