@@ -5,8 +5,9 @@ same calls as `mocap ingest` with `pose.attitude: pictures`. The camera's true p
 times, as two kinds of logs (`LOGS`) would.
 
 `off` is the root mean square angle, over draws and key pictures, from the truth. `bound` is that of an
-unbiased estimate that knows the path's shape and how attitudes differ (Cramér and Rao, of a similarity on the
-same places and a horizon level to 2 deg). `NEES` is the mean squared common error by its covariance.
+unbiased estimate that knows the path's shape and how attitudes differ (Cramér and Rao, of a similarity on
+places and a horizon level to 2 deg; satellite places tell less than the true horizon, which is level).
+`NEES` is the mean squared common error over its mean variance by axis, 3 where right.
 
 `--joined` takes the places away, too (`pose: pictures`, stature stated). `off` is then that of the cameras'
 mean attitudes after one similarity; joints are compared in true axes, with their own scale.
@@ -89,8 +90,7 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
         yield "joined", markdown_table(columns, [joined(name) for name in options.flights or JOINED_FLIGHTS])
         return
     names = options.flights or (KEPT if options.kept else TUNED)
-    each = [text for log in LOGS for text in (f"{log}: off (bound) deg", "NEES")]
-    heading = ["flight", "camera", "moves m", "refused", *each]
+    heading = ["flight", "camera", "moves m", "refused", "rtk: off (bound)", "NEES", "gps: off deg", "NEES"]
     rows = [row for name in names for row in measured(name, options.draws)]
     yield "attitudes-kept" if options.kept else "attitudes-tuned", markdown_table(heading, rows)
 
@@ -135,8 +135,8 @@ def _figures(
     rows = np.flatnonzero((t_ns >= at_ns[0]) & (t_ns <= at_ns[-1]) & (np.arange(len(t_ns)) % step == 0))
     covariance = position_covariance(errors, t_ns[rows] / 1e9)
     bound = np.degrees(_bound_rad(position[rows], matrix_from_quaternion(true), covariance))
-    shown = f"{np.degrees(np.sqrt(np.mean(off))):.2f}" if off else "-"
-    return draws - len(off), f"{shown} ({bound:.2f})", f"{np.mean(nees):.1f}" if off else "-"
+    shown = f"{np.degrees(np.sqrt(np.mean(off))):.2f}" + f" ({bound:.2f})" * (step_s < 1.0) if off else "-"
+    return draws - len(off), shown, f"{np.mean(nees):.1f}" if off else "-"
 
 
 def _bound_rad(places: Float, turn: Float, covariance: Float) -> float:

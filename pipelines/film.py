@@ -110,7 +110,8 @@ def film_settings(stated: str) -> tuple[FilmSettings, Path | None]:
             except ValueError:
                 numbers[key] = np.nan
             if not low <= numbers[key] <= high:
-                raise ValueError(f"{key} {values[key]!r} is no number from {low:g} to {high:g}")
+                stated = f"{key} {values[key]!r} is no number from {low:g} to {high:g}"
+                raise ValueError(f"{stated}; besides it there are start=, end=, detector= and scenario=")
     settings = FilmSettings(
         numbers["rate_hz"], numbers.get("start"), numbers.get("end"), values.get("detector", "blazepose")
     )
@@ -518,7 +519,7 @@ def _measured(
 
     def reconstructed(draw: int) -> tuple[Float, str | None]:
         own, seen = cameras[draw], observed[draw]
-        alone = {of: getattr(seen, of)[:, person : person + 1] for of in ("rays", "confidence")}
+        alone = {name: getattr(seen, name)[:, person : person + 1] for name in ("rays", "confidence")}
         views = views_as_stated(own, replace(seen, **alone))
         prior = [errors for camera in own if (errors := camera.errors) is not None]
         corrected = any(camera.modes is not None for camera in own)

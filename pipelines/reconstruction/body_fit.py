@@ -51,7 +51,7 @@ _BLOCK = 128
 _SHAPE_STEPS, _POSE_STEPS = 12, 6
 # A landmark this many standard deviations off has half its weight.
 _CAUCHY = 3.0
-# Weights of landmarks and amplitudes of modes in turn: then neither changes.
+# Weights of landmarks and amplitudes of modes are computed in turn; after three rounds neither changes.
 _AMPLITUDE_STEPS = 3
 # A joint beyond its range is held back as if by a measurement this good.
 _BOUND_RAD = np.radians(5.0)
@@ -314,7 +314,7 @@ class Points:
     """Landmarks, and joints of the bones, as functions of pose and shared unknowns."""
 
     # A range is taken as three standard deviations to both sides of the usual posture. On the tuning flights
-    # bodies are 1 % worse with two, and statures with four.
+    # bodies are 1 % worse with two, and statures are worse with four.
     usual_share = 1 / 3
 
     def __init__(self, model: BodyModel, landmarks: Landmarks) -> None:

@@ -2,11 +2,11 @@
 
 Key pictures are chosen by time. Points are followed from each to the next ones through all pictures of a
 film; pictures that are too far apart in time for that are matched by SIFT features. COLMAP's global mapper
-(Pan et al. 2024) maps them. Over flat ground some of its maps contradict their own sightings: those begin
-anew on a plane. The map depends on the pictures and the lens alone, so it
-is kept while places, clocks and noise change. A similarity lays it on the logged places, roughly. One
-bundle adjustment then has the sightings, the places with errors that are correlated in time, and a level
-horizon as evidence. Its covariance is that of the attitudes.
+(Pan et al. 2024) maps them. Over flat ground some of its maps contradict their own sightings; those are made
+again from the plane of the ground. The map depends on the pictures and the lens alone, so it is kept while
+places, clocks and noise change. A similarity lays it on the logged places, roughly. One bundle adjustment
+then has the sightings, the places with errors that are correlated in time, and a level horizon as evidence.
+Its covariance is that of the attitudes.
 
 Each camera is mapped by itself: views of two drones that are 90 degrees apart share too little, and a joint
 map of the sample flight was wrong by 6 m. Where no log has places, people whom several cameras see join
@@ -104,7 +104,7 @@ FAR_SHARE_TO_MAP_AGAIN = 0.1
 PLANE_STEPS = (-12, -8, -5, -3, 3, 5, 8, 12)
 # Points on a plane that are further away, in heights of the camera above it, are seen too flatly to place.
 MAX_PLANE_DISTANCE = 30.0
-# Larger errors above a plane are those of points beside it, and a chain of poses with this mean is none.
+# Larger errors above a plane are those of points beside it, and a chain with this mean error shows no plane.
 MAX_PLANE_ERROR_PX = 30.0
 # Loss of sightings in the rounds of the adjustment, px: the map's bend first, the points' errors last.
 LOSS_ROUNDS_PX = (30.0, 6.0, 2.0)
@@ -297,7 +297,8 @@ def map_pictures(
 ) -> PictureMap:
     """Map key pictures by their features, refining a guessed focal length; NoAttitudesError: too few.
 
-    A map of a film that its own sightings contradict begins anew on a plane, and the better one counts.
+    A map of a film that its own sightings contradict is made again from a plane, and the better one counts.
+    A plane does not determine the focal length, which stays as guessed.
     """
     found = _mapped(features, intrinsics, refine_focal=refine_focal)
     film = any(len(each.point) for each in features)
@@ -356,7 +357,7 @@ def _mapped(features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_f
             " has no parallax, and one that turns fast has pictures that share nothing"
         )
     if refine_focal and not _determines_focal(model):
-        return map_pictures(features, intrinsics)
+        return _mapped(features, intrinsics, refine_focal=False)
     return _read_model(model, features, focal_px)
 
 
@@ -438,8 +439,9 @@ def _mapped_above_plane(features: Sequence[KeyFeatures], intrinsics: Intrinsics)
     if not chains or chains[0][2] >= MAX_PLANE_ERROR_PX:
         raise NoAttitudesError("its pictures show no plane")
     at, turn, _ = chains[0]
-    names, every = [each.point for each in features], range(len(features))
-    found = _with_sightings(every, at, quaternion_from_matrix(turn), names, features, 1.0)
+    key = np.flatnonzero(turn.any(axis=(1, 2)))
+    at, turn, names = at[key], turn[key], [each.point for each in features]
+    found = _with_sightings(key.tolist(), at, quaternion_from_matrix(turn), names, features, 1.0)
     # The poses of the chain hold scale and place, loosely.
     bundle = _Bundle(found, focal_px, np.eye(len(at)), at, np.eye(len(at)) / found.size**2)
     fit = _adjusted(Similarity(1.0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)), bundle)
@@ -447,7 +449,7 @@ def _mapped_above_plane(features: Sequence[KeyFeatures], intrinsics: Intrinsics)
 
 
 def _homography(source: Float, target: Float, focal_px: float) -> Float | None:
-    """Fit a homography to points [N, 2] on a plane and x/z and y/z [N, 2]; None: it is not determined."""
+    """Fit a homography from points [N, 2] to image points x/z, y/z [N, 2]; None: it is not determined."""
     if len(source) < MIN_MATCHES:
         return None
     found = cv2.findHomography(source, target, cv2.RANSAC, FAR_PX / focal_px)[0]
@@ -460,7 +462,8 @@ def _chain_above_plane(
     """Place pictures one by one, from the middle one at (0, 0, 1), above the plane z = 0.
 
     `normal` [3] points from it to the plane, in its camera. Return places [K, 3], world_from_camera
-    [K, 3, 3] and the mean error of points as if all were on the plane, px; infinite if the chain breaks.
+    [K, 3, 3], 0 of a picture that shares too little, and the mean error of points as if all were on the
+    plane, px; infinite if too few pictures are placed.
     """
     count, middle = len(features), len(features) // 2
     right = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
@@ -475,20 +478,22 @@ def _chain_above_plane(
             there = placed[own.point[known]]
             view = _homography(there, own.xy[known], focal_px)
             if view is None:
-                return at, turn, np.inf
+                continue
             view *= np.sign(np.median(there @ view[2, :2] + view[2, 2]))
             view /= np.sqrt(np.linalg.norm(view[:, 0]) * np.linalg.norm(view[:, 1]))
             u, _, vt = np.linalg.svd(np.column_stack([view[:, :2], np.cross(view[:, 0], view[:, 1])]))
-            turn[k] = (u @ vt).T
-            at[k] = -turn[k] @ view[:, 2]
-            if not at[k, 2] > 0:
-                return at, turn, np.inf
+            place = -(u @ vt).T @ view[:, 2]
+            if not place[2] > 0:
+                continue
+            at[k], turn[k] = place, (u @ vt).T
             seen = (np.insert(there, 2, 0.0, axis=1) - at[k]) @ turn[k]
             errors.append(focal_px * np.linalg.norm(seen[:, :2] / seen[:, 2:] - own.xy[known], axis=1))
         ray = np.insert(own.xy, 2, 1.0, axis=1) @ turn[k].T
         away = np.linalg.norm(ray, axis=1) / np.maximum(-ray[:, 2], 0.5 / MAX_PLANE_DISTANCE)
         new = ~known & (away < MAX_PLANE_DISTANCE)
         placed[own.point[new]] = (at[k] - at[k, 2] * ray[new] / ray[new, 2:])[:, :2]
+    if turn.any(axis=(1, 2)).mean() < MIN_MAPPED_SHARE or not sum(map(len, errors)):
+        return at, turn, np.inf
     return at, turn, float(np.minimum(np.concatenate(errors), MAX_PLANE_ERROR_PX).mean())
 
 

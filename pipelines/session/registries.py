@@ -321,7 +321,7 @@ class Registry(Generic[T]):
             self._kinds[kinds] = [
                 self.get(name) for name in self.names() if isinstance(self.get(name), kinds)
             ]
-        return self._kinds[kinds]
+        return list(self._kinds[kinds])
 
 
 FORMATS: Registry[Format] = Registry("mocap.formats", "format")
