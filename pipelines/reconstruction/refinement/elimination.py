@@ -94,9 +94,9 @@ def step(system: System, at: Eliminated) -> State:
         knots[interval : interval + 2] = alive[2 * n : 2 * n + 2 * count].reshape(2, count)
     for first, last, factors in _factors_backwards(system, at):
         for begin, stop, knot in _backwards(system, first, last, interval, factors.first_interval):
-            if stop is None:
+            if begin == stop:
                 interval, row = knot, knot - factors.first_interval
-                z = np.concatenate([position[begin + 1 : begin + 3].ravel(), knots[knot + 1], shared])
+                z = np.concatenate([position[begin : begin + 2].ravel(), knots[knot + 1], shared])
                 rest = factors.knot_solved[row] - z @ factors.knot_across[row]
                 knots[knot] = rest @ factors.knot_inverse[row]
             else:
@@ -219,15 +219,16 @@ def _eliminate(system: System, state: State, front: _Front, first: int, last: in
         begin = first
         while True:
             while c and front.interval < system.of_time[begin]:
-                _eliminate_knot(
-                    front, n, c, *(e[front.interval - factors.first_interval] for e in factors[4:])
-                )
+                row = front.interval - factors.first_interval
+                knot = factors.knot_inverse[row], factors.knot_across[row], factors.knot_solved[row]
+                _eliminate_knot(front, n, c, *knot)
                 front.interval += 1
                 _tie_knots(front, sweep, n)
             if begin == last:
                 return factors
             stop = min(last, int(np.searchsorted(system.of_time, front.interval, "right"))) if c else last
-            own = (each[begin - first : stop - first] for each in factors[1:4])
+            rows = slice(begin - first, stop - first)
+            own = factors.inverse[rows], factors.across[rows], factors.solved[rows]
             forwards(begin, sweep, front.matrix, front.gradient, *own)
             begin = stop
     except np.linalg.LinAlgError as error:
@@ -271,17 +272,17 @@ def _tie_knots(front: _Front, sweep: Sweep, n: int) -> None:
 
 def _backwards(
     system: System, first: int, last: int, interval: int, least: int
-) -> Iterator[tuple[int, int | None, int]]:
-    """Yield a segment from its end: stretches [first, last) between two knots, and each knot's elimination.
+) -> Iterator[tuple[int, int, int]]:
+    """Yield a segment from its end: stretches [first, last) between two knots, and the knot before each.
 
-    A stretch has the knot before it. A knot has no last time, and first is the time before it was eliminated;
-    those from `least` come before the segment.
+    An empty stretch is the elimination of its knot before the time `first`. Knots before the segment are
+    eliminated from `least` on.
     """
     knots, stop = system.layout.entries.knot_count > 0, last
     while True:
         while knots and interval > (system.of_time[stop - 1] if stop > first else least):
             interval -= 1
-            yield stop - 1, None, interval
+            yield stop, stop, interval
         if stop == first:
             return
         begin = max(first, int(np.searchsorted(system.of_time, interval))) if knots else first
@@ -325,7 +326,7 @@ def _visit(system: System, state: State, at: Eliminated, covariance: Float, ever
         _add_walk(others, n, sweep, interval, found.walked)
     for first, last, factors in _factors_backwards(system, at):
         for begin, stop, knot in _backwards(system, first, last, interval, factors.first_interval):
-            if stop is None:
+            if begin == stop:
                 interval, row = knot, knot - factors.first_interval
                 others = _before_knot(others, n, factors.knot_inverse[row], factors.knot_across[row])
                 if walks:
