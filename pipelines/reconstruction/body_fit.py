@@ -267,7 +267,7 @@ def fit_body(
     first = _first_poses(model, landmarks, place[chosen])
     own, _, scale = errors(chosen)
     shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], own), float(np.median(scale)))
-    parts = []
+    joined: list[Float] = []
     for start in range(0, len(row), _BLOCK):
         rows = row[start : start + _BLOCK]
         own, common, _ = errors(rows)
@@ -276,19 +276,13 @@ def fit_body(
             points, first, seen, shared, shared_covariance
         )
         quaternion = quaternion_from_matrix(turn)
-        parts.append((quaternion, turn_covariance, centre, centre_covariance + common[:, None]))
-    rotation, rotation_covariance, centre, centre_covariance = (
-        np.concatenate(part) for part in zip(*parts, strict=True)
-    )
-    return BodyFit(
-        shared.shape,
-        shared_covariance[:12, :12],
-        row,
-        rotation,
-        rotation_covariance,
-        centre,
-        centre_covariance,
-    )
+        part = quaternion, turn_covariance, centre, centre_covariance + common[:, None]
+        joined = joined or [np.empty((len(row), *each.shape[1:])) for each in part]
+        for of_all, each in zip(
+            joined, part, strict=True
+        ):  # parts would be in memory twice if joined at last
+            of_all[start : start + len(rows)] = each
+    return BodyFit(shared.shape, shared_covariance[:12, :12], row, *joined)
 
 
 def _seen(place: Float, covariance: Float) -> Places:
