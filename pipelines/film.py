@@ -110,8 +110,8 @@ def film_settings(stated: str) -> tuple[FilmSettings, Path | None]:
             except ValueError:
                 numbers[key] = np.nan
             if not low <= numbers[key] <= high:
-                stated = f"{key} {values[key]!r} is no number from {low:g} to {high:g}"
-                raise ValueError(f"{stated}; besides it there are start=, end=, detector= and scenario=")
+                problem = f"{key} {values[key]!r} is no number from {low:g} to {high:g}"
+                raise ValueError(f"{problem}; the keys are start=, end=, detector= and scenario=")
     settings = FilmSettings(
         numbers["rate_hz"], numbers.get("start"), numbers.get("end"), values.get("detector", "blazepose")
     )

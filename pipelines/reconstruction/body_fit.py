@@ -267,7 +267,7 @@ def fit_body(
     first = _first_poses(model, landmarks, place[chosen])
     own, _, scale = errors(chosen)
     shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], own), float(np.median(scale)))
-    joined: list[Float] = []
+    joined: list[Float] = []  # filled part by part, because parts joined at last are in memory twice
     for start in range(0, len(row), _BLOCK):
         rows = row[start : start + _BLOCK]
         own, common, _ = errors(rows)
@@ -278,9 +278,7 @@ def fit_body(
         quaternion = quaternion_from_matrix(turn)
         part = quaternion, turn_covariance, centre, centre_covariance + common[:, None]
         joined = joined or [np.empty((len(row), *each.shape[1:])) for each in part]
-        for of_all, each in zip(
-            joined, part, strict=True
-        ):  # parts would be in memory twice if joined at last
+        for of_all, each in zip(joined, part, strict=True):
             of_all[start : start + len(rows)] = each
     return BodyFit(shared.shape, shared_covariance[:12, :12], row, *joined)
 

@@ -23,6 +23,8 @@ from pipelines.reconstruction.body_fit import (
     Poses,
     Rays,
     Shared,
+    _bounded,
+    _less,
     _seen,
     fit_body,
     joint_ranges,
@@ -94,14 +96,21 @@ def test_derivatives_are_those_of_the_cost(cameras: int) -> None:
         assert normal.pose_right[0, d] == pytest.approx(-(costs[0] - costs[1]) / (4 * step), abs=1e-3)
     for g in range(0, 13 + landmarks.offset.size, 5):
         change = step * (np.arange(13 + landmarks.offset.size) == g)
-        costs = []
-        for way in (1, -1):
-            other = shared.moved(way * change)
-            cost = points.normal(poses, seen, other, whole=False).cost.sum() + points.prior.cost(other)
-            costs.append(cost)
-        assert normal.shared_right[g] == pytest.approx(
-            -(costs[0] - costs[1]) / (4 * step), rel=1e-3, abs=1e-3
-        )
+        others = [shared.moved(way * change) for way in (1, -1)]
+        moments = [points.normal(poses, seen, other, whole=False).cost.sum() for other in others]
+        costs = [cost + points.prior.cost(other) for cost, other in zip(moments, others, strict=True)]
+        assert normal.shared_right[g] == pytest.approx(np.diff(costs)[0] / (4 * step), rel=1e-3, abs=1e-3)
+
+
+def test_modes_of_landmarks_count_as_their_covariance_does() -> None:
+    rng = np.random.default_rng(1)
+    # Errors of 1e-3 standard deviations have weights of 1 to 1e-6.
+    white, modes = 1e-3 * rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5, 3, 4))
+    error, flat, unit = white.reshape(2, 15, 1), modes.reshape(2, 15, 4), np.eye(15)[None].repeat(2, axis=0)
+    precision = np.linalg.inv(unit + flat @ flat.mT)
+    _, cost, shift = _bounded(white, modes)
+    np.testing.assert_allclose(cost, (error.mT @ precision @ error).ravel(), rtol=1e-5)
+    np.testing.assert_allclose(_less(shift, _less(shift, unit)), precision, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

@@ -380,6 +380,3 @@ def test_nothing_of_others_is_written_over(content: SessionContent, tmp_path: Pa
     (tmp_path / "session.json").write_text("{}")
     with pytest.raises(DataError, match="is a session"):
         refuse_foreign(tmp_path, overwrite=True)
-
-
-# --- series ---

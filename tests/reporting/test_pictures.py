@@ -100,9 +100,6 @@ def test_ellipses_hold_95_percent(view: OverlayView) -> None:
     assert not changed(draw_frame(GROUND, replace(alone, spread=1e8 * spread), ()))[~drawn].any()
 
 
-# --- panels ---
-
-
 @pytest.mark.parametrize("scale", [1, 2])
 def test_a_picture_lies_under_its_pixels(view: OverlayView, scale: int) -> None:
     """White from 568 to 572 by 340 to 344 px, in a picture as large as the calibration's or twice."""

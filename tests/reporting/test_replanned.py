@@ -95,9 +95,6 @@ def test_several_people_have_rows_of_their_own() -> None:
     assert people.rows[1][4] == ("–", "")
 
 
-# --- the map ---
-
-
 def _around(occupancy: Occupancy, low: tuple[float, float], high: tuple[float, float]) -> MapAround:
     found = map_around(occupancy, np.array(low), np.array(high))
     assert found is not None

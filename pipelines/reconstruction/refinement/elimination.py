@@ -182,7 +182,6 @@ def _sweep(system: System, state: State) -> Sweep:
     return Sweep(
         equations=system.equations(state),
         starts=np.searchsorted(system.pictures.first, np.arange(len(t_s) - 1)),
-        of_time=system.of_time,
         curvature=np.stack(
             [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))], axis=1
         ),
@@ -192,9 +191,6 @@ def _sweep(system: System, state: State) -> Sweep:
         bones=system.problem.bones,
         bone_sigma=system.knowledge.bone_sigma_m,
         grown=system.grown(state),
-        knot_t_s=system.problem.knot_t_s,
-        tie_kept=system.tie_kept,
-        tie_variance=system.tie_variance,
     )
 
 
@@ -214,7 +210,7 @@ def _eliminate(system: System, state: State, front: _Front, first: int, last: in
     )
     sweep = _sweep(system, state)
     if c and first == 0:
-        _tie_knots(front, sweep, n)
+        _tie_knots(front, system, state.knots, n)
     try:
         begin = first
         while True:
@@ -223,7 +219,7 @@ def _eliminate(system: System, state: State, front: _Front, first: int, last: in
                 knot = factors.knot_inverse[row], factors.knot_across[row], factors.knot_solved[row]
                 _eliminate_knot(front, n, c, *knot)
                 front.interval += 1
-                _tie_knots(front, sweep, n)
+                _tie_knots(front, system, state.knots, n)
             if begin == last:
                 return factors
             stop = min(last, int(np.searchsorted(system.of_time, front.interval, "right"))) if c else last
@@ -256,10 +252,10 @@ def _eliminate_knot(front: _Front, n: int, c: int, inverse: Float, across: Float
     matrix[after, :end], matrix[end:, after], gradient[after] = 0.0, 0.0, 0.0
 
 
-def _tie_knots(front: _Front, sweep: Sweep, n: int) -> None:
+def _tie_knots(front: _Front, system: System, knots: Float, n: int) -> None:
     """Add the prior of the change between the knot before and the knot after."""
-    knots, interval = sweep.equations.state.knots, front.interval
-    kept, q = sweep.tie_kept[interval], sweep.tie_variance[interval]
+    interval = front.interval
+    kept, q = system.tie_kept[interval], system.tie_variance[interval]
     change = knots[interval + 1] - kept * knots[interval]
     before = 3 * n + np.arange(len(q))
     after = before + len(q)
@@ -323,14 +319,14 @@ def _visit(system: System, state: State, at: Eliminated, covariance: Float, ever
     n, size, walks = 3 * joints, system.size, bool(knot_count and every)
     whole = np.empty((size, size))
     if walks:
-        _add_walk(others, n, sweep, interval, found.walked)
+        _add_walk(others, n, system, state.knots, interval, found.walked)
     for first, last, factors in _factors_backwards(system, at):
         for begin, stop, knot in _backwards(system, first, last, interval, factors.first_interval):
             if begin == stop:
                 interval, row = knot, knot - factors.first_interval
                 others = _before_knot(others, n, factors.knot_inverse[row], factors.knot_across[row])
                 if walks:
-                    _add_walk(others, n, sweep, interval, found.walked)
+                    _add_walk(others, n, system, state.knots, interval, found.walked)
             else:
                 for time in range(stop - 1, begin - 1, -1):
                     others = _before_time(
@@ -384,10 +380,10 @@ def _before_knot(alive: Float, n: int, inverse: Float, across: Float) -> Float:
     return joined
 
 
-def _add_walk(alive: Float, n: int, sweep: Sweep, interval: int, walked: Float) -> None:
+def _add_walk(alive: Float, n: int, system: System, knots: Float, interval: int, walked: Float) -> None:
     """Add the change of the slow errors between two knots, per second."""
-    knots, c = sweep.equations.state.knots, len(walked)
-    elapsed = sweep.knot_t_s[interval + 1] - sweep.knot_t_s[interval]
+    knot_t_s, c = system.problem.knot_t_s, len(walked)
+    elapsed = knot_t_s[interval + 1] - knot_t_s[interval]
     before = 2 * n + np.arange(c)
     after = before + c
     variance = (alive[before, before] + alive[after, after] - 2 * alive[before, after]) / elapsed
@@ -407,7 +403,6 @@ class Sweep(NamedTuple):
 
     equations: Equations
     starts: Int64  # [T - 1] index of the first picture of each time
-    of_time: Int64  # [T - 1] the knot before each eliminated time, and the last but one
     curvature: Float  # [T - 2, 3] weights of three positions for their acceleration
     spread: Float  # [T - 2] its variance relative to the usual
     precision: Float  # [J, J] of an acceleration
@@ -415,9 +410,6 @@ class Sweep(NamedTuple):
     bones: Int64  # [B, 2]
     bone_sigma: Float  # [B] m
     grown: float  # size of the body over that for which the priors hold
-    knot_t_s: Float  # [K]
-    tie_kept: Float  # [K - 1, c] share of a slow error that is left at the next knot
-    tie_variance: Float  # [K - 1, c] added variance
 
 
 class Factors(NamedTuple):
