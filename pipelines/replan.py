@@ -133,7 +133,7 @@ def replan(
             (run.folder / arm).mkdir()
             for table in made[arm].glob("*.parquet"):
                 shutil.copyfile(table, run.folder / arm / table.name)
-            return_unused()
+            return_unused(cycles=False)
             progress.advance()
         results = {arm: read_result(place) for arm, place in made.items()}
         keypoints = f"modelled after {errors.detector}"

@@ -240,10 +240,11 @@ def _linear_points(rotation: Float, centre: Float, along: Float, seen: Bool) -> 
 
 def _midpoints(direction: Float, centre: Float, weight: Float, wanted: Bool) -> Float:
     """Compute the points [N, 3] closest to the viewing lines: sum w (I - d d') (X - c) = 0."""
-    across = weight[..., None, None] * (np.eye(3) - direction[..., :, None] * direction[..., None, :])
-    normal = np.where(wanted[:, None, None], across.sum(axis=1), np.eye(3))
-    right = (across @ centre[..., None]).sum(axis=1)
-    return np.linalg.solve(_closed(normal), right)[..., 0]
+    beside = centre - direction * np.einsum("nca,nca->nc", direction, centre)[..., None]
+    along = (direction * weight[..., None]).mT @ direction
+    total = weight.sum(axis=1)[:, None, None] * np.eye(3)
+    normal = np.where(wanted[:, None, None], total - along, np.eye(3))
+    return np.linalg.solve(_closed(normal), np.einsum("nc,nca->na", weight, beside)[..., None])[..., 0]
 
 
 def _closed(normal: Float) -> Float:

@@ -93,15 +93,14 @@ _LIMBS = (("elbow", "wrist", "pinky", "index", "thumb"), ("knee", "ankle", "heel
 class ErrorTable:
     """Measured errors by joint (`ANY_JOINT` for all others) and tilt."""
 
-    rows: Mapping[str, Float]  # [K, 4]: tilt in degrees, rising; median error share; missed share; confidence
+    rows: Mapping[str, Float]
+    """Rows [K, 4]: tilt in degrees, rising and the same for all; median error, missed share, confidence."""
 
     def at(self, tilt_deg: Float, joints: tuple[str, ...]) -> tuple[Float, Float, Float]:
         """Return median error share, missed share, confidence [T, J]; linear between measured tilts."""
-        tables = [self.rows.get(name, self.rows[ANY_JOINT]) for name in joints]
-        values = np.empty((3, len(tilt_deg), len(joints)))
-        for j, table in enumerate(tables):
-            for k in range(3):
-                values[k, :, j] = np.interp(tilt_deg, table[:, 0], table[:, k + 1])
+        tables = np.stack([self.rows.get(name, self.rows[ANY_JOINT]) for name in joints], axis=1)  # [K, J, 4]
+        near = [np.interp(tilt_deg, tables[:, 0, 0], hat) for hat in np.eye(len(tables))]
+        values = np.einsum("kt,kjc->ctj", near, tables[..., 1:])
         return values[0], values[1], values[2]
 
 
