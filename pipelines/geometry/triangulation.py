@@ -54,7 +54,7 @@ _MAX_PAIRS = 28
 # The intermediate arrays of this many joint-frames stay in a processor's cache.
 _BLOCK = 4096
 # Arrays that hold a pose for each of so many joint-frames, some minutes of a flight, take 200 MB.
-_ROWS_AT_ONCE = 1 << 18
+ROWS_AT_ONCE = 1 << 18
 # A median over this many joint-frames is accurate to one per cent.
 _NOISE_SAMPLE = 20_000
 # The inliers of the first round set the gate of the second.
@@ -128,7 +128,7 @@ def triangulate(
     return _joined(
         (
             _triangulate_block(
-                _rows(views, slice(first, first + _BLOCK)), poses, method, gate, with_covariance
+                rows_of(views, slice(first, first + _BLOCK)), poses, method, gate, with_covariance
             )
             for first in range(0, max(count, 1), _BLOCK)
         ),
@@ -317,9 +317,9 @@ def _covariance(
 
 def reprojection_px(views: Views, points: Float) -> Float:
     """Compute the reprojection distance [N, C] in px of views; NaN for absent views, inf behind a camera."""
-    if len(points) > _ROWS_AT_ONCE:
-        parts = [slice(first, first + _ROWS_AT_ONCE) for first in range(0, len(points), _ROWS_AT_ONCE)]
-        return np.concatenate([reprojection_px(_rows(views, part), points[part]) for part in parts])
+    if len(points) > ROWS_AT_ONCE:
+        parts = [slice(first, first + ROWS_AT_ONCE) for first in range(0, len(points), ROWS_AT_ONCE)]
+        return np.concatenate([reprojection_px(rows_of(views, part), points[part]) for part in parts])
     rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
     x, y, z = np.einsum("ncij,nci->jnc", rotation, points[:, None] - position)
     depth = np.where(z > 0, z, 1.0)
@@ -343,7 +343,7 @@ def estimate_noise(views: Views) -> Float:
     if cameras < 2:
         return views.pixel_sigma
     chosen = np.linspace(0, n - 1, min(n, _NOISE_SAMPLE)).astype(np.int64)
-    sample = _rows(views, chosen)
+    sample = rows_of(views, chosen)
 
     def explain(seen: Views, method: Method, sigma: Float) -> Float:
         result = triangulate(replace(seen, pixel_sigma=sigma), method=method)
@@ -443,10 +443,10 @@ def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) ->
     camera. A camera that shows fewer than five of them is not judged. Views that are left out are not inliers
     but have their residuals. Without gross errors, the result is that of `triangulate`, byte for byte.
     """
-    if len(picture) > _ROWS_AT_ONCE:
-        cuts = np.searchsorted(picture, picture[_ROWS_AT_ONCE::_ROWS_AT_ONCE]).tolist()
+    if len(picture) > ROWS_AT_ONCE:
+        cuts = np.searchsorted(picture, picture[ROWS_AT_ONCE::ROWS_AT_ONCE]).tolist()
         parts = (
-            triangulate_pictures(_rows(views, part), picture=picture[part], pixel_sigma=pixel_sigma)
+            triangulate_pictures(rows_of(views, part), picture=picture[part], pixel_sigma=pixel_sigma)
             for part in (slice(*ends) for ends in pairwise([0, *cuts, len(picture)]))
         )
         return _joined((tuple(vars(part).values()) for part in parts), len(picture))
@@ -459,12 +459,13 @@ def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) ->
     lost = rows[np.isnan(found.points[rows, 0])]
     status, residual_px = found.status.copy(), found.residual_px.copy()
     status[lost] = STATUS.index("rejected")
-    again = reprojection_px(_rows(views, rows), found.points[rows])
+    again = reprojection_px(rows_of(views, rows), found.points[rows])
     residual_px[rows] = np.where(gross[rows], again, residual_px[rows])
     return replace(found, status=status, residual_px=residual_px)
 
 
-def _rows(views: Views, rows: slice | Int64) -> Views:
+def rows_of(views: Views, rows: slice | Int64) -> Views:
+    """Take some joint-frames."""
     return replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
 
 

@@ -25,11 +25,13 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import WHITE_SHARE, PoseErrors
 from pipelines.geometry.triangulation import (
     PIXEL_SIGMA_PX,
+    ROWS_AT_ONCE,
     STATUS,
     Triangulation,
     Views,
     estimate_noise,
     reprojection_px,
+    rows_of,
     triangulate,
     triangulate_pictures,
 )
@@ -200,14 +202,25 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
         return RefinedFlight(flight.observations, flight.views, flight.result, None, metrics, warnings)
 
     observed, views = _observe_refined(refined, flight, offset_s)
-    gated = triangulate(views, method="robust")
-    position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
-    ok = (gated.status == STATUS.index("ok")) & ~np.isnan(position[:, 0])
-    np.copyto(gated.points, position, where=ok[:, None])
-    np.copyto(gated.covariance, covariance, where=ok[:, None, None])
-    result = replace(gated, residual_px=reprojection_px(views, gated.points))
-    poses = _camera_table(flight, refined, offset_s)
-    return RefinedFlight(observed, views, result, poses, metrics, warnings)
+    result = _gated(views, refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3))
+    return RefinedFlight(observed, views, result, _camera_table(flight, refined, offset_s), metrics, warnings)
+
+
+def _gated(views: Views, points: Float, covariance: Float) -> Triangulation:
+    """Refuse points [N, 3] m where `robust` does, and take its own where they are NaN.
+
+    They and their covariances [N, 3, 3] become the result: those of a long flight are not in memory twice.
+    """
+    parts = []
+    for first in range(0, max(len(points), 1), ROWS_AT_ONCE):
+        own = slice(first, first + ROWS_AT_ONCE)
+        seen = rows_of(views, own)
+        gated = triangulate(seen, method="robust")
+        other = (gated.status != STATUS.index("ok")) | np.isnan(points[own, 0])
+        points[own][other], covariance[own][other] = gated.points[other], gated.covariance[other]
+        parts.append((gated.inlier, gated.status, gated.views, reprojection_px(seen, points[own])))
+    inlier, status, count, residual_px = map(np.concatenate, zip(*parts, strict=True))
+    return Triangulation(points, inlier, status, covariance, count, residual_px)
 
 
 # --- clocks --------------------------------------------------------------------------------------------
@@ -611,8 +624,8 @@ class _Joined:
         if not used:
             return replace(parts[0], position=np.full_like(self._position, np.nan))
         with np.errstate(invalid="ignore", divide="ignore"):
-            position = self._position / self._weight[..., None]
-            covariance = self._covariance / self._weight[..., None, None]
+            self._position /= self._weight[..., None]
+            self._covariance /= self._weight[..., None, None]
         numbers = [sums[:, :10] / np.maximum(sums[:, 10:], 1e-12) for sums in self._numbers]
         warnings = dict.fromkeys(line for part in used for line in part.warnings)
         if len(used) < len(parts):
@@ -622,8 +635,8 @@ class _Joined:
         names = dict.fromkeys(name for part in used for name in part.levels)
         return replace(
             used[0],
-            position=position,
-            covariance=covariance,
+            position=self._position,
+            covariance=self._covariance,
             corrections=tuple(zip(self._frames, numbers, strict=True)),
             clock_offset_s=np.median([part.clock_offset_s for part in used], axis=0),
             clock_sigma_s=np.median([part.clock_sigma_s for part in used], axis=0),
