@@ -139,7 +139,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=54)
+RECONSTRUCT = Stage("reconstruct", revision=55)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -260,7 +260,7 @@ def reconstruct(
         gait, walks = gait_of(stored.observations, stored.result)
         bodies = stored.bodies
         if bodies is None:
-            bodies = fit_bodies(stored.observations, stored.views, stored.result)
+            bodies = flight.waiting.put(fit_bodies(stored.observations, stored.views, stored.result))
         flight.waiting.release()
         metrics = stored.metrics | {
             "gait": walks,
@@ -281,7 +281,7 @@ def reconstruct(
                 f"the poses were disturbed by {disturbance.text}: the skeleton and the figures without"
                 f" `trials` are those of {draws} (seed {disturbance.seed}), not the flight's"
             )
-        _write_tables(run.folder, stored, gait, bodies)
+        _write_tables(run.folder, stored, gait, bodies, flight.waiting)
         metrics = write_figures(run.folder, jsonable(metrics), description)
         warnings += [*stored.warnings, *_unused_cameras(flight.cameras, stored.result)]
         record = run.publish(counts=_counts(metrics, stored, flight.swaps), warnings=warnings)
@@ -392,14 +392,18 @@ def _raise_if_nothing_was_measured(folder: Path, attempt: Attempt, doubts: Seque
 
 
 def _write_tables(
-    folder: Path, attempt: Attempt, gait: pd.DataFrame, bodies: Sequence[BodyFit | None]
+    folder: Path, attempt: Attempt, gait: pd.DataFrame, bodies: Sequence[BodyFit | None], waiting: Waiting
 ) -> None:
     observations, views, result = attempt.observations, attempt.views, attempt.result
-    join_tables(folder / "skeleton.parquet", skeleton_parts(observations, result), SKELETON)
-    join_tables(folder / "angles.parquet", angles_parts(observations, views, result, bodies), ANGLES)
+    skeletons, angles = (
+        skeleton_parts(observations, result),
+        angles_parts(observations, views, result, bodies),
+    )
+    join_tables(folder / "skeleton.parquet", waiting.between(skeletons), SKELETON)
+    join_tables(folder / "angles.parquet", waiting.between(angles), ANGLES)
     write_table(folder / "gait.parquet", gait, GAIT)
     if any(body is not None for body in bodies):
-        join_tables(folder / "body.parquet", body_parts(observations.t_ns, bodies), BODY)
+        join_tables(folder / "body.parquet", waiting.between(body_parts(observations.t_ns, bodies)), BODY)
         write_table(folder / "body_shape.parquet", shape_rows(bodies), BODY_SHAPE)
     if attempt.poses is not None:
         write_table(folder / "cameras.parquet", attempt.poses, CAMERA_POSES)
@@ -607,6 +611,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
     )
+    result = flight.waiting.put(result)
     flight.waiting.release()
     truth = None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns)
     names = [camera.name for camera in cameras]

@@ -20,11 +20,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from pipelines.geometry.arrays import Float, Index, Int64
+from pipelines.geometry.arrays import Float, Float32, Index, Int64
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE_SIGMA, BodyModel, body_model, turned
 from pipelines.geometry.poses import (
     cross_matrix,
@@ -144,9 +145,9 @@ class BodyFit:
     shape_covariance: Float  # [12, 12]
     row: Index  # [N] the times that have a pose, ascending
     rotation: Float  # [N, 22, 4] world_from_bone relative to the neutral pose
-    rotation_covariance: Float  # [N, 22, 3, 3] rad^2, of a rotation vector in the world
     centre: Float  # [N, 22, 3] m, joints of the bones, the pelvis's first
-    centre_covariance: Float  # [N, 22, 3, 3] m^2
+    rotation_covariance: Float32  # [N, 22, 3, 3] rad^2, of a rotation vector in the world
+    centre_covariance: Float32  # [N, 22, 3, 3] m^2
 
 
 @dataclass(frozen=True)
@@ -267,7 +268,7 @@ def fit_body(
     first = _first_poses(model, landmarks, place[chosen])
     own, _, scale = errors(chosen)
     shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], own), float(np.median(scale)))
-    joined: list[Float] = []  # filled part by part, because parts joined at last are in memory twice
+    joined: list[Any] = []  # filled part by part, because parts joined at last are in memory twice
     for start in range(0, len(row), _BLOCK):
         rows = row[start : start + _BLOCK]
         own, common, _ = errors(rows)
@@ -276,8 +277,9 @@ def fit_body(
             points, first, seen, shared, shared_covariance
         )
         quaternion = quaternion_from_matrix(turn)
-        part = quaternion, turn_covariance, centre, centre_covariance + common[:, None]
-        joined = joined or [np.empty((len(row), *each.shape[1:])) for each in part]
+        covariances = np.float32(turn_covariance), np.float32(centre_covariance + common[:, None])
+        part: tuple[Any, ...] = (quaternion, centre, *covariances)
+        joined = joined or [np.empty((len(row), *each.shape[1:]), each.dtype) for each in part]
         for of_all, each in zip(joined, part, strict=True):
             of_all[start : start + len(rows)] = each
     return BodyFit(shared.shape, shared_covariance[:12, :12], row, *joined)

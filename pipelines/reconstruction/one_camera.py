@@ -171,7 +171,7 @@ def fit_seen_body(
     across = pose_sigma[known, 0] ** 2 + np.sum(ray**2, axis=1) * pose_sigma[known, 1] ** 2
     along = _DISTANCE_SHARE**2 * ray[:, :, None] * ray[:, None]
     common = (across[:, None, None] * np.eye(3) + along)[:, None]
-    body = replace(found.body, centre_covariance=found.body.centre_covariance + common)
+    body = replace(found.body, centre_covariance=found.body.centre_covariance + common.astype(np.float32))
     return SeenBody(body, found.place, found.covariance + common)
 
 
@@ -243,9 +243,9 @@ def _at_every_time(
         fit.shared_covariance[:12, :12],
         known,
         rotation,
-        turning,
         _placed(every, fit.shared.shape[0], np.tensordot(shares, points.centres, 1)),
-        of_joints,
+        turning.astype(np.float32),
+        of_joints.astype(np.float32),
     )
     return SeenBody(body, _placed(every, fit.shared.shape[0], points.vectors(fit.shared)), of_places)
 

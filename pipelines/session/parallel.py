@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
@@ -252,6 +252,12 @@ class Waiting:
         whole = memoryview(mapped)
         copy: T = pickle.loads(head, buffers=[whole[place] for place in places])  # noqa: S301  # our own
         return copy
+
+    def between(self, parts: Iterable[T]) -> Iterator[T]:
+        """Yield parts, and give back what each of them took."""
+        for part in parts:
+            yield part
+            self.release()
 
     def release(self) -> None:
         """Give back the memory of all arrays, and what is unused; who looks at them again reads the file."""
