@@ -824,6 +824,7 @@ def _robust_flight(
         workers=flight.workers,
         executor=flight.executor,
         trusted=np.array([not doubt for doubt in _doubted(made)]),
+        stature_m=flight.description.stature_m,
         waiting=flight.waiting,
     )
 

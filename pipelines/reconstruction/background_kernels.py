@@ -84,10 +84,13 @@ def _sighting(
 
 @helper
 def _hold(normal: Float) -> None:
-    """Make a point's equations positive definite; a point behind all of its pictures stays where it is."""
+    """Make a point's equations positive definite; a point behind all of its pictures stays where it is.
+
+    What is added must be small: with 1e-9, thousands of points held a camera's place as a log of 2.5 m does.
+    """
     for i in range(3):
         sighted = normal[0, 0] + normal[1, 1]
-        normal[i, i] += 1e-9 * sighted if sighted > 0.0 else 1.0
+        normal[i, i] += 1e-13 * sighted if sighted > 0.0 else 1.0
 
 
 @helper

@@ -35,6 +35,7 @@ from pipelines.geometry.triangulation import (
     triangulate,
     triangulate_pictures,
 )
+from pipelines.reconstruction.body_fit import landmarks_of
 from pipelines.reconstruction.clocks import (
     FINE_STEP_S,
     MIN_OFFSET_BY_PEOPLE_S,
@@ -53,10 +54,12 @@ from pipelines.reconstruction.observations import (
     on_sides,
     sightings_of,
 )
+from pipelines.reconstruction.one_camera import STATED_STATURE_SIGMA_M, STATURE_M
+from pipelines.reconstruction.picture_map import LIMB_SIGMA_SHARE
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
-from pipelines.reconstruction.refinement.system import Sighting
+from pipelines.reconstruction.refinement.system import Sighting, UsualSize
 from pipelines.reconstruction.results import poses_table
-from pipelines.reconstruction.solving import pictures_of
+from pipelines.reconstruction.solving import MIN_SIGMA_M, pictures_of, position_sigma_m
 from pipelines.session.description import Interpolation
 from pipelines.session.parallel import Waiting, available_bytes, each_part
 from pipelines.session.people import bones_of
@@ -114,6 +117,7 @@ class RobustFlight:
     workers: int  # see `refine_in_windows`
     executor: Executor | None  # works on the windows instead
     trusted: Bool  # [P] people who determine cameras and clocks; the others are triangulated afterwards
+    stature_m: float | None = None  # of the people, as stated
     only_limbs: bool = False  # other joints are not refined
     waiting: Waiting | None = None  # where the arrays wait meanwhile
 
@@ -276,6 +280,8 @@ def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, refere
     sigma_s = np.where(settled, refined.clock_sigma_s, FINE_STEP_S)
     least_s = np.maximum(MIN_OFFSET_BY_PEOPLE_S, np.where(settled, MIN_SIGMAS_BY_PEOPLE * sigma_s, 0.0))
     wrong = suspect & (np.abs(offset_s) >= least_s)
+    if any(position_sigma_m(errors) >= MIN_SIGMA_M for errors in flight.prior or ()):
+        wrong &= settled  # rays of places that are metres off meet better at other times
     offset_s, sigma_s = np.where(wrong, [offset_s, sigma_s], 0.0)
     return FoundClocks(
         offset_s, sigma_s, none, wrong=dict.fromkeys(np.array(names)[wrong].tolist(), "keypoints")
@@ -348,6 +354,7 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Float) 
         flight.clock_sigma_s,
         windows=flight.windows,
         measured=flight.measured,
+        size=usual_size(flight.observations.joints, people, flight.stature_m),
         workers=flight.workers,
         executor=flight.executor,
     )
@@ -471,6 +478,22 @@ def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
     return np.concatenate([own + person * len(joints) for person in range(people)])
 
 
+def usual_size(joints: tuple[str, ...], people: int, stature_m: float | None) -> UsualSize | None:
+    """Return the usual sizes of people by their legs among the rigid pairs; None without known landmarks."""
+    found = landmarks_of(joints)
+    if found is None:
+        return None
+    stature, sigma_m = STATURE_M if stature_m is None else (stature_m, STATED_STATURE_SIGMA_M)
+    rest = dict(zip(found[0].joints, stature * found[0].at_rest, strict=True))
+    pairs = [(joints[first], joints[second]) for first, second in rigid_pairs(joints, 1).tolist()]
+    lengths = [
+        float(np.linalg.norm(rest[a] - rest[b])) if "knee" in a + b and {a, b} <= {*rest} else 0.0
+        for a, b in pairs
+    ]
+    of_all: Float = np.kron(np.eye(people), np.array(lengths))
+    return UsualSize(of_all, float(np.hypot(LIMB_SIGMA_SHARE, sigma_m / stature)))
+
+
 def _is_of_trunk(one: str, other: str) -> bool:
     ends = {name.removeprefix("left_").removeprefix("right_") for name in (one, other)}
     return "hip" in ends and not ends.isdisjoint(("neck", "shoulder"))
@@ -533,6 +556,7 @@ class _Order:
     prior: list[PoseErrors] | None
     clock_sigma_s: Float
     measured: bool
+    size: UsualSize | None
 
     def within(self, window: FlightWindow) -> _Order:
         """Take the data of a window."""
@@ -559,12 +583,13 @@ def refine_in_windows(
     *,
     windows: Sequence[FlightWindow],
     measured: bool = False,
+    size: UsualSize | None = None,
     workers: int = 1,
     executor: Executor | None = None,
 ) -> Refined:
     """Run `refine` on some windows, and join the results: medians of clocks, NaN joints where none is."""
     levels = None if prior is None else list(prior)
-    whole = _Order(t_s, tuple(sightings), start, bones, levels, clock_sigma_s, measured)
+    whole = _Order(t_s, tuple(sightings), start, bones, levels, clock_sigma_s, measured, size)
     if len(windows) == 1 and windows[0].stop - windows[0].first == len(t_s):
         return _refine(whole)
     if executor is None:
@@ -588,6 +613,7 @@ def _refine(order: _Order) -> Refined:
         order.prior,
         order.clock_sigma_s,
         measured=order.measured,
+        size=order.size,
     )
 
 

@@ -460,12 +460,6 @@ def test_pictures_without_a_pose_stay_without() -> None:
     assert np.isfinite(np.delete(found.position, 10, axis=0)).all()
 
 
-def test_the_same_points_give_the_same_bytes() -> None:
-    first, second = (refined(12.0, 1)[0] for _ in range(2))
-    assert first.position.tobytes() == second.position.tobytes()
-    assert first.covariance.tobytes() == second.covariance.tobytes()
-
-
 def test_points_are_followed_and_people_left_out() -> None:
     """Follow a textured plane that moves by (3, 1) px a picture, with a person's box to leave out."""
     rng = np.random.default_rng(6)
@@ -580,7 +574,7 @@ def test_a_bias_of_40_deg_is_found_beside_white_errors_that_nobody_stated(places
     stated = PosePrior.of(pose_errors([places, Bias(rotation_deg=20)]))
     found = adjusted(*sighted(position, rotation, rng), (at + 1.5, wrong), stated)
     assert found.left is not None, found.refused
-    assert sum(each.sigma0**2 for each in found.left.processes if each.number == SHIFT_IN_WORLD) > 1.0
+    assert sum(each.sigma0**2 for each in found.left.processes if each.number == SHIFT_IN_WORLD) > 2.1
     # Places that drift by 0.2 m in a second may turn a way of 8 m by 2 deg.
     assert np.abs(errors_deg(found.rotation, rotation).mean(axis=0)).max() < 1.0
 

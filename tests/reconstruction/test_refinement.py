@@ -33,7 +33,15 @@ from pipelines.reconstruction.refinement.refine import (
     corrected,
     refine,
 )
-from pipelines.reconstruction.refinement.system import Knowledge, System, build, lay_out, misfit, prior_cost
+from pipelines.reconstruction.refinement.system import (
+    Knowledge,
+    System,
+    UsualSize,
+    build,
+    lay_out,
+    misfit,
+    prior_cost,
+)
 from tests.reconstruction.formations import BONES, STATED_PX, Formation, formation, mean_mm
 
 WHITE = White(position_m=0.3, rotation_deg=1.0)
@@ -94,7 +102,8 @@ def small_system(*, exact: bool, times: int = 5, knots: int = 3) -> tuple[System
     ]
     if not exact:
         sightings[1] = replace(sightings[1], t_s=sightings[1].t_s + 0.008)
-    problem = build(flight.t_s, sightings, np.array([[0, 1], [1, 2]]))
+    size = UsualSize(np.array([[0.5, 0.0], [0.5, 0.9]]), 0.05)
+    problem = build(flight.t_s, sightings, np.array([[0, 1], [1, 2]]), size)
     knot_t_s = np.linspace(0.0, flight.t_s[-1], knots)
     knot_t_s[1:-1] -= 1e-9  # so that times are clearly beyond them
     problem = replace(problem, knot_t_s=knot_t_s)
@@ -313,21 +322,17 @@ def test_a_place_that_nobody_saw_is_the_log_s() -> None:
     assert np.median(miss_px) < 2.0  # keypoints err by 2 px: 1.35 of it in the median
 
 
-def test_a_wrong_prior_is_noticed() -> None:
-    # Stated is a constant error of the medium level, true is a random walk: never worse than the log.
-    flight = formation(90, 3, [Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)], 4)
-    position, _, fallback = refined(flight, [BIAS])
-    if fallback is None:
-        assert mean_mm(position, flight.truth) < 1.05 * mean_mm(flight.start, flight.truth)
-
-
-def test_exact_poses_are_recognised() -> None:
-    # Two views without stated noise: every level must come down from its guess.
-    flight = formation(90, 2, [], 0)
-    position, _, fallback = refined(flight, None)
-    assert fallback is None
-    # Time and bones take at least a third off errors of 2 px.
-    assert mean_mm(position, flight.truth) < 0.67 * mean_mm(flight.start, flight.truth)
+def test_lasting_errors_of_metres_leave_the_place_unknown_and_the_size_to_what_is_usual() -> None:
+    models: list[NoiseModel] = [Bias(position_m=1.5, rotation_deg=0.1), Drift(position_m_per_sqrt_s=0.5)]
+    flight = formation(180, 3, models, 0)
+    lengths = np.linalg.norm(np.diff(flight.truth[:, BONES], axis=2), axis=-1).mean(axis=0)[:, 0]
+    size = UsualSize(1.05 * lengths[None], 1e-3)
+    prior = [pose_errors(models)] * 3
+    found = refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(3), size=size)
+    assert found.fallback is None
+    assert found.bone_lengths_m.sum() == pytest.approx(1.05 * lengths.sum(), rel=3e-3)
+    # What three cameras share of their errors before they drift: 1.5 m / sqrt(3).
+    assert np.sqrt(found.covariance[0, :, 2, 2].mean()) == pytest.approx(1.5 / np.sqrt(3), rel=0.05)
 
 
 def test_keypoint_errors_that_last_are_not_taken_for_pose_errors() -> None:

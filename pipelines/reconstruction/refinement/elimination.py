@@ -45,8 +45,9 @@ _SEGMENT = 256
 _KEPT_BYTES = 80e6
 # Bone lengths with this precision (1 / m^2) do not move.
 _HELD = 1e10
-# An unseen joint is within this distance of its start.
-_ANYWHERE_M = 100.0
+# An unseen joint is within this distance of its start, and so is every other joint at each time: 100 m held a
+# whole flight of 6 s within 1.5 m.
+_ANYWHERE_M = 1e4
 
 
 @dataclass
@@ -172,6 +173,11 @@ def _begin(system: System, state: State) -> _Front:
     for place in range(n3 + 2 * layout.entries.knot_count + layout.bone_column, system.size):
         # A length without data keeps its value.
         front.matrix[place, place] += _HELD if system.held else 1e-6
+    if system.problem.size is not None:
+        bones = slice(n3 + 2 * layout.entries.knot_count + layout.bone_column, system.size)
+        slope, missed = system.problem.size.equations(state.shared[layout.bone_column :])
+        front.matrix[bones, bones] += slope.T @ slope
+        front.gradient[bones] += slope.T @ missed
     return front
 
 

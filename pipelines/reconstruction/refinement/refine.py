@@ -32,6 +32,7 @@ from pipelines.reconstruction.refinement.system import (
     Problem,
     Sighting,
     System,
+    UsualSize,
     build,
     misfit,
 )
@@ -121,7 +122,6 @@ class Refined:
     clock_sigma_s: Float  # [C] its posterior standard deviation, 0 for known clocks
     levels: dict[str, float]
     bone_lengths_m: Float  # [B'] of the bones with two refined joints that took part in the last estimate
-    acceleration: Float  # [P, P] (m/s^2)^2, estimated covariance of the P refined joints' accelerations
     learned: bool  # the levels of the pose errors were estimated from the pictures
     warnings: tuple[str, ...]
     fallback: str | None  # reason why the result must not be used
@@ -136,13 +136,14 @@ def refine(
     clock_sigma_s: Float,
     *,
     measured: bool = False,
+    size: UsualSize | None = None,
 ) -> Refined:
     """Estimate a skeleton, its cameras' pose errors and clocks together (maximum a posteriori).
 
     Times [T] strictly increase; `start` [T, J, 3] m is by a triangulation that trusts the poses, NaN where it
-    found nothing; `bones` [B, 2] are pairs of joints with a nearly constant distance; `clock_sigma_s` [C] is
-    0 for a known clock. Where a `prior` that was not `measured` does not explain the pictures, levels are
-    estimated.
+    found nothing; `bones` [B, 2] are pairs of joints with a nearly constant distance, and `size` is that of
+    people by them; `clock_sigma_s` [C] is 0 for a known clock. Where a `prior` that was not `measured` does
+    not explain the pictures, levels are estimated.
     """
     part = np.sum(~np.isnan(start[..., 0]), axis=0) >= _FEWEST_TIMES
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
@@ -152,6 +153,7 @@ def refine(
         tuple(_of_joints(sighting, part) for sighting in sightings),
         _renumbered(bones, part),
         _without_gaps(t_s, start[:, part]),
+        None if size is None else size.of_bones(part[bones].all(axis=1)),
     )
     del sightings  # a clock's offset and the choice of joints made copies
     refused = None
@@ -181,15 +183,16 @@ class _RefinementInput:
     sightings: tuple[Sighting, ...]
     bones: Int64  # [B, 2]
     start: Float  # [T, J, 3] m, without gaps
+    size: UsualSize | None
 
     def problem(self) -> Problem:
         """Build the problem of the whole flight."""
-        return build(self.t_s, self.sightings, self.bones)
+        return build(self.t_s, self.sightings, self.bones, self.size)
 
     def stretches(self) -> tuple[Problem, Float]:
         """Build that of the stretches from which the prior is learned, and take their start [T', J, 3]."""
         chosen = _stretches(len(self.t_s))
-        problem = build(self.t_s[chosen], self.sightings, self.bones)
+        problem = build(self.t_s[chosen], self.sightings, self.bones, self.size)
         return problem, self.start[chosen]
 
 
@@ -246,7 +249,6 @@ def _refined(views: _RefinementInput, prior: _Prior, *, measured: bool) -> Refin
         clock_sigma_s=clock_left_s,
         levels=_levels(known),
         bone_lengths_m=state.shared[len(state.shared) - len(known.bone_sigma_m) :],
-        acceleration=known.acceleration,
         learned=prior.learned,
         warnings=(
             *prior.warnings,
@@ -738,7 +740,6 @@ def _none(cameras: int, start: Float, reason: str) -> Refined:
         clock_sigma_s=np.zeros(cameras),
         levels={},
         bone_lengths_m=np.empty(0),
-        acceleration=np.empty((0, 0)),
         learned=False,
         warnings=(),
         fallback=reason,

@@ -1,7 +1,9 @@
 """Refinement problem: pictures, the skeleton's times, the priors of errors, and the cost of a state."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -115,6 +117,26 @@ class Knowledge:
 
 
 @dataclass(frozen=True)
+class UsualSize:
+    """Sizes of P people by the sums of some bones' lengths."""
+
+    lengths_m: Float  # [P, B] usual lengths, 0 for bones that do not count
+    sigma: float  # standard deviation of a sum, relative to it
+
+    def of_bones(self, kept: Bool) -> UsualSize | None:
+        """Return the sizes by the bones that are kept [B]; None if none of them counts."""
+        lengths = self.lengths_m[:, kept]
+        lengths = lengths[lengths.any(axis=1)]
+        return replace(self, lengths_m=lengths) if len(lengths) else None
+
+    def equations(self, lengths: Float) -> tuple[Float, Float]:
+        """Return derivatives [P, B] by the lengths [B] m, and residuals [P], in standard deviations."""
+        usual = self.lengths_m.sum(axis=1, keepdims=True)
+        slope = (self.lengths_m > 0) / (self.sigma * usual)
+        return slope, slope @ lengths - 1 / self.sigma
+
+
+@dataclass(frozen=True)
 class Problem:
     """Refinement problem without the parameters of the prior."""
 
@@ -122,6 +144,7 @@ class Problem:
     pictures: Pictures
     bones: Int64  # [B, 2]
     knot_t_s: Float  # [K]
+    size: UsualSize | None = None
     pose_covariance: Float = field(default_factory=lambda: np.empty((0, 6, 6)))
     """Covariances [L, 6, 6] of logged white pose errors: world shift (m), camera rotation vector (rad)."""
 
@@ -175,7 +198,7 @@ class Sighting:
         return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.rays[..., 0]).all(axis=1)
 
 
-def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
+def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, size: UsualSize | None = None) -> Problem:
     """Build the problem of times [T] and `bones` [B, 2]; pictures near none of the times are left out."""
     step = float(np.median(np.diff(t_s)))
     covariances, logged, parts = [np.empty((0, 6, 6))], 0, []
@@ -210,7 +233,7 @@ def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
     pictures = Pictures(**{name: values[order] for name, values in joined.items()})
     knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
     knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
-    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances))
+    return Problem(t_s, pictures, bones, knot_t_s, size, np.concatenate(covariances))
 
 
 def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
@@ -418,4 +441,7 @@ def _body_cost(system: System, state: State) -> float:
         ends = position[:AT_ONCE, problem.bones]
         missed = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1) - lengths
         cost += np.sum((missed / system.knowledge.bone_sigma_m) ** 2)
-    return float(cost) / system.grown(state) ** 2
+    cost /= system.grown(state) ** 2
+    if problem.size is not None:
+        cost += np.square(problem.size.equations(lengths)[1]).sum()
+    return float(cost)
