@@ -256,10 +256,10 @@ def measure_draw(
                 except DataError as error:
                     yield case, Outcome(error=str(error))
                 else:
-                    yield case, _outcome(session)
+                    yield case, outcome_of(session)
 
 
-def _outcome(session: Path) -> Outcome:
+def outcome_of(session: Path) -> Outcome:
     skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON)
     skeleton = skeleton[skeleton["person"] == 0]
     joints = tuple(skeleton["joint"].iloc[: skeleton["joint"].nunique()])

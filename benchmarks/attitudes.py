@@ -9,6 +9,9 @@ unbiased estimate that knows the path's shape and how attitudes differ (Cramér 
 places and a horizon level to 2 deg; satellite places tell less than the true horizon, which is level).
 `NEES` is the mean squared common error over its mean variance by axis, 3 where right.
 
+`--used` reconstructs flights in turn with attitudes by pictures, and with logged ones (`TURNED`) on the same
+places. Ratios are of root-relative errors: of the means, and by draw. NEES is of joints.
+
 `--joined` takes the places away, too (`pose: pictures`, stature stated). `off` is then that of the cameras'
 mean attitudes after one similarity; joints are compared in true axes, with their own scale.
 """
@@ -18,7 +21,8 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -28,10 +32,10 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
-from benchmarks.corpus.stored import flights, read_backgrounds, read_keypoints
+from benchmarks.corpus.stored import Flight, flights, read_backgrounds, read_keypoints
 from benchmarks.results import markdown_table, parser_of, show
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.noise import Bias, GaussMarkov, NoiseModel, White, disturb, pose_errors
+from pipelines.geometry.noise import NoiseModel, disturb, pose_errors
 from pipelines.geometry.poses import (
     conjugate,
     cross_matrix,
@@ -55,22 +59,29 @@ from pipelines.reconstruction.picture_map import (
     map_pictures,
     position_covariance,
 )
+from pipelines.session.camera_poses import noise_models
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
-from pipelines.session.records import Detections
+from pipelines.session.records import Detections, Trajectory
 from pipelines.simulation.flight import SimulatedDrone
 from pipelines.simulation.flight_files import write_tum
-from pipelines.sources.attitudes import FilmOfCamera, UnposedCamera, posed_by_people
+from pipelines.sources.attitudes import FilmOfCamera, UnposedCamera, posed_by_people, turned_by_pictures
 from pipelines.sources.parts import CameraFrames
 
 TUNED = ("01-walk", "02-jog", "06-turn", "07-jog", "15-two-people", "16-two-people", "05-dance")
 KEPT = ("08-walk", "14-dance", "24-two-people-dance", "18-stand")
 """Flights that no constant was chosen on. The last of each half hovers."""
-LOGS: dict[str, tuple[list[NoiseModel], float]] = {
-    "rtk": ([White(position_m=0.02), Bias(position_m=0.05)], 0.1),
-    "gps": ([GaussMarkov(position_m=1.5, correlation_s=100)], 1.0),
+Noise = dict[str, dict[str, float | str]]
+LOGS: dict[str, tuple[Noise, float]] = {
+    "rtk": ({"white": {"position_m": 0.02}, "bias": {"position_m": 0.05}}, 0.1),
+    "gps": ({"gauss-markov": {"position_m": 1.5, "correlation_s": 100}}, 1.0),
 }
 """Errors of places, and the time between two of them, s."""
+TURNED: Noise = {"white": {"rotation_deg": 0.2}, "bias": {"rotation_deg": 0.5}}
+FAR: Noise = {"white": {"rotation_deg": 0.2}, "bias": {"rotation_deg": 20.0}}
+"""Errors of logged attitudes, stated: usual ones, and those of a mount that nobody knows."""
+USED = {"rtk": ("rtk", None), "gps": ("gps", None), "rtk, 20 deg off": ("rtk", FAR)}
+"""Logs of `--used`, and errors of their attitudes, None where pictures show these."""
 JOINED_FLIGHTS = "07-jog", "23-jog-and-crouch", "02-jog", "08-walk", "16-two-people"
 """Flights of three drones that move; the first two were tuned on."""
 
@@ -80,6 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kept", action="store_true", help="measure on the flights that are kept aside")
     parser.add_argument("--flights", nargs="+", help="names, instead of all of that half")
     parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--used", nargs="*", choices=USED, help="reconstruct with them (all logs by default)")
     parser.add_argument("--joined", action="store_true", help="take the places away, too")
 
 
@@ -90,6 +102,11 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
         yield "joined", markdown_table(columns, [joined(name) for name in options.flights or JOINED_FLIGHTS])
         return
     names = options.flights or (KEPT if options.kept else TUNED)
+    if options.used is not None:
+        columns = ["log", "reconstructed", "logged, other mm", "ratio", "by draw: median, largest", "NEES"]
+        rows = [used(options.flights or names[:-1], log, options.draws) for log in options.used or USED]
+        yield f"attitudes-used-{'kept' if options.kept else 'tuned'}", markdown_table(columns, rows)
+        return
     heading = ["flight", "camera", "moves m", "refused", "rtk: off (bound)", "NEES", "gps: off deg", "NEES"]
     rows = [row for name in names for row in measured(name, options.draws)]
     yield "attitudes-kept" if options.kept else "attitudes-tuned", markdown_table(heading, rows)
@@ -109,7 +126,8 @@ def measured(name: str, draws: int) -> Iterator[list[str]]:
         except NoAttitudesError:
             yield [*row, "not mapped", *4 * ["-"]]
             continue
-        figures = [_figures(found, drone, *log, draws) for log in LOGS.values()]
+        logs = [(noise_models("LOGS", noise), step_s) for noise, step_s in LOGS.values()]
+        figures = [_figures(found, drone, *log, draws) for log in logs]
         row.append(f"{sum(refused for refused, *_ in figures)}/{len(figures) * draws}")
         yield row + [text for _, *texts in figures for text in texts]
 
@@ -150,6 +168,79 @@ def _bound_rad(places: Float, turn: Float, covariance: Float) -> float:
     return float(np.sqrt(np.trace(np.linalg.inv(normal)[:3, :3])))
 
 
+def used(names: Sequence[str], log: str, draws: int) -> list[str]:
+    """Measure joints with attitudes by pictures (or far off), and with logged ones on the same places."""
+    (place_log, far), found = USED[log], []
+    noise, step_s = LOGS[place_log]
+    models, usual, off = (noise_models("LOGS", each or TURNED) for each in (noise, TURNED, far))
+    for draw in range(draws):
+        (flight,) = [each for each in flights() if each.name == names[draw % len(names)]]
+        backgrounds, logged, other = read_backgrounds(flight), {}, {}
+        with TemporaryDirectory() as folder, suppress(DataError):
+            drawn = DrawnFlight(flight, Path(folder) / "shared")
+            drawn.write_shared()
+            for number, drone in enumerate(drawn.simulated.drones):
+                t_ns, true = drone.at_frames.t_ns, drone.at_frames.camera_position
+                poses, name = (t_ns, true, drone.at_frames.camera_quaternion_xyzw), drone.name
+                seeds = [5, draw, number], [5, draw]  # receivers share half of the variance
+                errors = [disturb(models, *poses, np.random.default_rng(seed))[0] - true for seed in seeds]
+                step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)
+                rows = np.append(np.arange(0, len(t_ns) - 1, step), len(t_ns) - 1)
+                places = (true + np.sqrt(0.5) * (errors[0] + errors[1]))[rows]
+                between = np.stack([np.interp(t_ns, t_ns[rows], axis) for axis in places.T], axis=1)
+                seed = [6, draw, number]
+                turned, away = (
+                    disturb(each, *poses, np.random.default_rng(seed))[1] for each in (usual, off)
+                )
+                logged[name] = Trajectory(t_ns, between, turned), _both(noise, TURNED)
+                other[name] = Trajectory(t_ns, between, away), _both(noise, far or TURNED)
+                if far is None:
+                    by = turned_by_pictures(
+                        flight.name, name, FilmOfCamera("", nullcontext),  # type: ignore[arg-type]
+                        CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), drone.intrinsics,
+                        Trajectory(t_ns[rows], places, np.full((len(rows), 4), np.nan)), refine_focal=False,
+                        pose_noise=noise, satellite_sigma_m=None, note=lambda _: None, progress=Silent(),
+                        kept=partial(_map_of, drone, backgrounds[name].tracks),
+                    )  # fmt: skip
+                    other[name] = by.trajectory, by.pose_noise
+            sessions = [_session_of(drawn, Path(folder) / str(k), of) for k, of in enumerate((logged, other))]
+            found.append([_outcome(flight, session) for session in sessions])
+            print(flight.name, log, draw, found[-1], file=sys.stderr, flush=True)
+    if not found:
+        return [log, f"0/{draws}", *4 * ["-"]]
+    (first, nees), (second, others) = np.mean(found, axis=0)
+    ratio = [each[1][0] / each[0][0] for each in found]
+    row = [f"{first:.0f}, {second:.0f}", f"{second / first:.2f}", f"{np.median(ratio):.2f}, {max(ratio):.2f}"]
+    return [log, f"{len(found)}/{draws}", *row, f"{nees:.1f}, {others:.1f}"]
+
+
+def _both(places: Noise, turns: Noise) -> Noise:
+    return {model: places.get(model, {}) | turns.get(model, {}) for model in places | turns}
+
+
+def _session_of(drawn: DrawnFlight, place: Path, tracks: Mapping[str, tuple[Trajectory, Noise]]) -> Path:
+    """Ingest a flight whose cameras have these poses; what was logged of people and places is left out."""
+    manifest = drawn.session(place, 0, "model", "blazepose", poses="true").with_name("flight.yaml")
+    text = re.sub(r"^(actors?|map):.*\n(  .*\n)*", "", manifest.read_text("utf-8"), flags=re.MULTILINE)
+    for camera, (track, noise) in tracks.items():
+        t_ns = track.t_ns + drawn.flight.scenario.start_ns
+        write_tum(manifest.with_name(f"{camera}.tum"), t_ns, track.position, track.quaternion_xyzw)
+        stated = rf"pose: {{file: truth/{camera}\.tum}}(\n    pose_noise: .*)?"
+        text = re.sub(stated, f"pose: {camera}.tum\n    pose_noise: {json.dumps(noise)}", text)
+    manifest.write_text(text, encoding="utf-8")
+    return ingest(manifest, manifest.with_name("posed")).folder
+
+
+def _outcome(flight: Flight, session: Path) -> tuple[float, float]:
+    """Reconstruct with the keypoints and the background that are kept; return root-relative mm, and NEES."""
+    from benchmarks.accuracy import outcome_of  # which imports this module
+
+    with kept_in_place_of_pictures(flight, "blazepose"):
+        reconstruct(session, ReconstructSettings(people=1))
+    found = outcome_of(session)
+    return found.root_mpjpe_mm or np.nan, found.nees or np.nan
+
+
 def joined(name: str) -> list[str]:
     """Measure a flight without any pose, and its joints beside those with logged poses."""
     (flight,) = [each for each in flights() if each.name == name]
@@ -174,27 +265,18 @@ def joined(name: str) -> list[str]:
         places = [(tracks[drone].position, true[drone][0]) for drone in tracks]
         to_true = first_similarity(*(np.concatenate(each) for each in zip(*places, strict=True)))[0]
         drawn.write_shared()
-        sessions = [drawn.session(Path(folder) / "logged", 0, "model", "blazepose")]
-        session = drawn.session(Path(folder) / "true", 0, "model", "blazepose", poses="true")
-        manifest = session.with_name("flight.yaml")
-        # What was logged of people and places is not there to be used.
-        text = re.sub(r"^(actors?|map):.*\n(  .*\n)*", "", manifest.read_text("utf-8"), flags=re.MULTILINE)
-        off, nees = [], []
+        off, nees, moved = [], [], {}
         for camera, track in tracks.items():
             noise = posed[camera].pose_noise
             now = multiply(to_true.quaternion_xyzw, track.quaternion_xyzw)
             apart = rotation_vector_from_quaternion(multiply(now, conjugate(true[camera][1]))).mean(axis=0)
             off.append(np.degrees(np.linalg.norm(apart)))
             nees.append(off[-1] ** 2 / float(noise["bias"]["rotation_deg"]) ** 2)
-            place, t_ns = to_true.places(track.position) / to_true.scale, track.t_ns
-            write_tum(manifest.with_name(f"{camera}.tum"), t_ns + flight.scenario.start_ns, place, now)
-            stated = rf"pose: {{file: truth/{camera}\.tum}}(\n    pose_noise: .*)?"
-            text = re.sub(stated, f"pose: {camera}.tum\n    pose_noise: {json.dumps(noise)}", text)
-        manifest.write_text(text, encoding="utf-8")
-        sessions.append(ingest(manifest, manifest.with_name("posed")).folder)
-        with kept_in_place_of_pictures(flight, "blazepose"):
-            done = [reconstruct(each, ReconstructSettings(people=1)).metrics for each in sessions]
-        errors = ", ".join(f"{metrics['root_mpjpe_mm']:.0f}" for metrics in done)
+            place = to_true.places(track.position) / to_true.scale
+            moved[camera] = Trajectory(track.t_ns, place, now), noise
+        sessions = [drawn.session(Path(folder) / "logged", 0, "model", "blazepose")]
+        sessions.append(_session_of(drawn, Path(folder) / "true", moved))
+        errors = ", ".join(f"{_outcome(flight, each)[0]:.0f}" for each in sessions)
         row = [name, f"{np.sqrt(np.square(off).mean()):.2f}", f"{np.mean(nees):.1f}"]
         return [*row, f"{100 / to_true.scale - 100:+.1f}", errors]
 

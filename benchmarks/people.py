@@ -3,12 +3,10 @@
 Three drones with GPS of 0.1 m circle the first person; keypoints have the measured errors of the detector,
 and a joint behind another person's body is hidden. Each scene is reconstructed with `--persons auto`, once
 with everybody's log and once with none. Alone is the MPJPE of the first person in a flight of the same seed
-in which nobody else is. Seeds 0 to 4 and 30 to 33 were looked at while the rules were made. `--films FOLDER`
-films the scenes instead (rendered, 640x360 px, among trees): the real detector finds the people.
+in which nobody else is. Seeds 0 to 4 and 30 to 33 were looked at while the rules were made.
 
 Seen: times at which two cameras or more see at least half of the joints of a true person. Coverage is the
-share of these at which somebody reconstructed is within 0.5 m of them. Detected is the share of these at
-which two cameras or more have a detection of the person (`detections_of`). All else is of metrics.json.
+share of these at which somebody reconstructed is within 0.5 m of them. All else is of metrics.json.
 """
 
 import argparse
@@ -16,12 +14,10 @@ import json
 import tempfile
 from collections.abc import Iterator
 from functools import cache
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from benchmarks.flights import scenario_of, walker
 from benchmarks.results import fixed, markdown_table
@@ -30,14 +26,12 @@ from pipelines.ingest import ingest
 from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.people import true_joints_at
-from pipelines.session.tables import KEYPOINTS, SKELETON, TRUTH, motion_from, read_table
+from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
 from pipelines.simulate import simulate
-from pipelines.simulation.detector_errors import see
-from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario, visible_joints
+from pipelines.simulation.flight import fly_scenario, visible_joints
 from pipelines.simulation.scenario import read_scenario
 
 WITHIN_M = 0.5
-DETECTED_M = 0.25
 JOG = {"distance_m": 14, "speed_mps": 2.4}
 
 SCENES: dict[str, dict[str, dict[str, Any]]] = {
@@ -65,18 +59,13 @@ SCENES: dict[str, dict[str, dict[str, Any]]] = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--seeds", type=int, nargs="+", help="default 10 11 12, of films 20")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[10, 11, 12])
     parser.add_argument("--scene", choices=SCENES, action="append")
-    parser.add_argument("--films", type=Path, metavar="FOLDER", help="film the scenes")
 
 
 def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
-    """Reconstruct modelled or filmed scenes."""
-    scenes = options.scene or list(SCENES)
-    if options.films:
-        yield "people-films", filmed_table(scenes, options.films, options.seeds or [FILM_SEED])
-    else:
-        yield "people", modelled_table(scenes, options.seeds or [10, 11, 12])
+    """Reconstruct the scenes."""
+    yield "people", modelled_table(options.scene or list(SCENES), options.seeds)
 
 
 def modelled_table(scenes: list[str], seeds: list[int]) -> list[str]:
@@ -100,25 +89,6 @@ def modelled_table(scenes: list[str], seeds: list[int]) -> list[str]:
             )
     header = ["scene", "logs", "found", "coverage %", "switches", "phantoms", "IDF1", "MPJPE"]
     return markdown_table([*header, "first, alone"], rows)
-
-
-def filmed_table(scenes: list[str], folder: Path, seeds: list[int]) -> list[str]:
-    """Write a line for each film."""
-    rows = []
-    for scene, seed in product(scenes, seeds):
-        row = filmed(scene, folder, seed)
-        alone = [filmed(scene, folder, seed, only)["mpjpe_mm"] for only in list(SCENES[scene])[:2]]
-        rows.append(
-            [
-                *(scene, f"{row['found']} of {row['people']}"),
-                *(f"{100 * row[key] / row['seen']:.1f}" for key in ("covered", "detected")),
-                *(str(row[key]) for key in ("switches", "phantoms")),
-                fixed(row["idf1"], 3),
-                *(" ".join(fixed(mm) for mm in those) for those in (row["each_mm"], alone)),
-            ]
-        )
-    header = ["film", "found", "coverage %", "detected %", "switches", "phantoms", "IDF1", "MPJPE of each"]
-    return markdown_table([*header, "first two, alone"], rows)
 
 
 _SUMS = ("covered", "seen", "switches", "phantoms")
@@ -164,34 +134,12 @@ def figures(session: Path, scenario: Path) -> dict[str, Any]:
     tracking, names = metrics["tracking"], metrics["people"]["names"]
     times = coverage(session, scenario)
     return {
-        "people": times.seen.shape[1],
         "found": sum(metrics["by_person"][name]["mpjpe_mm"] is not None for name in names),
         "covered": int((times.covered & times.seen).sum()),
         "seen": int(times.seen.sum()),
-        "detected": int((times.detected & times.seen).sum()),
-        "each_mm": [metrics["by_person"][name]["mpjpe_mm"] or np.nan for name in names],
         "mpjpe_mm": metrics["mpjpe_mm"],
         **{key: tracking[key] for key in ("switches", "phantoms", "idf1")},
     }
-
-
-FILM_SEED = 20
-
-
-def filmed(scene: str, folder: Path, seed: int, only: str | None = None) -> dict[str, Any]:
-    """Film a scene, or one of its people, where the folder does not have it yet; return the figures."""
-    people = SCENES[scene] if only is None else {only: SCENES[scene][only]}
-    number = [] if seed == FILM_SEED else [str(seed)]
-    place = folder / "_".join([*scene.split(), *number, *([only] if only else [])])
-    place.mkdir(parents=True, exist_ok=True)
-    plan = scenario_of(people, seed)
-    plan["world"]["wood"] = {"count": 10, "radius_m": 32, "clear_m": 13}
-    plan["drones"]["camera"] |= {"width": 640, "height": 360, "hfov_deg": 60}
-    scenario = place / "scenario.yaml"
-    scenario.write_text(json.dumps(plan), encoding="utf-8")
-    simulate(scenario, place / "flight")
-    session = ingest(place / "flight" / "flight.yaml", place / "flight.session").folder
-    return figures(session, scenario)
 
 
 class Times(NamedTuple):
@@ -199,11 +147,10 @@ class Times(NamedTuple):
 
     covered: Bool  # somebody reconstructed is within 0.5 m
     seen: Bool  # two cameras or more see at least half of the joints
-    detected: Bool  # two cameras or more have a detection
 
 
 def coverage(session: Path, scenario: Path) -> Times:
-    """Find when each true person is reconstructed, seen and detected."""
+    """Find when each true person is reconstructed and seen."""
     skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON)
     skeleton = skeleton.assign(**{axis: skeleton[axis].where(skeleton["status"] == "ok") for axis in "xyz"})
     joints = tuple(skeleton["joint"].unique())
@@ -216,37 +163,10 @@ def coverage(session: Path, scenario: Path) -> Times:
 
     plan = read_scenario(scenario)
     flight = fly_scenario(plan, noise_models(str(scenario), plan.drones.pose_noise))
-    seen, detected = np.zeros((2, len(motion.t_ns), len(flight.people)), np.int64)
+    seen = np.zeros((len(motion.t_ns), len(flight.people)), np.int64)
     for drone in flight.drones:
         frame = np.abs(drone.at_frames.t_ns[None] + plan.start_ns - motion.t_ns[:, None]).argmin(axis=1)
         for q, person in enumerate(flight.people):
             seen[:, q] += (visible_joints(flight, drone, person)[1].mean(axis=1) >= 0.5)[frame]
-        detected += detections_of(flight, drone, session)[frame]
     covered: Bool = np.asarray((distance <= WITHIN_M).any(axis=1))
-    return Times(covered, seen >= 2, detected >= 2)
-
-
-def detections_of(flight: SimulatedFlight, drone: SimulatedDrone, session: Path) -> Bool:
-    """Test [F, Q] in which pictures of a drone a detection is the person's."""
-    path = session / "detect" / drone.name / "keypoints.parquet"
-    if not path.is_file():
-        path = session / "cameras" / drone.name / "keypoints.parquet"
-    table = read_table(path, KEYPOINTS)
-    names, rows, camera = flight.people[0].person.joints, flight.moments_of(drone), drone.at_frames
-    table = table[table["joint"].isin(names)]
-    frame, joint = table["frame"].to_numpy(), [names.index(name) for name in table["joint"]]
-    apart_m = np.empty((len(table), len(flight.people)))
-    for q, person in enumerate(flight.people):
-        true = person.joints[rows]
-        pixels = see(
-            true, camera.camera_position[:, None], camera.camera_quaternion_xyzw[:, None], drone.intrinsics
-        )
-        range_m = np.linalg.norm(true.mean(axis=1) - camera.camera_position, axis=-1)
-        apart_px = np.linalg.norm(table[["x", "y"]].to_numpy() - pixels[frame, joint], axis=-1)
-        apart_m[:, q] = apart_px / drone.intrinsics.fx * range_m[frame]
-    of_each = pd.DataFrame(apart_m).groupby([frame, table["person"].to_numpy()]).median().fillna(np.inf)
-    nearest = of_each.to_numpy().argmin(axis=1)
-    good = of_each.to_numpy().min(axis=1) <= DETECTED_M
-    found = np.zeros((len(rows), len(flight.people)), np.bool_)
-    found[of_each.index.get_level_values(0)[good], nearest[good]] = True
-    return found
+    return Times(covered, seen >= 2)

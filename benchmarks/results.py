@@ -77,6 +77,7 @@ SECTIONS = (
             Part("gimbals-tuned", "Cameras that turn", REAL, TUNED),
             Part("attitudes-kept", "Attitudes from pictures", RENDERED, KEPT),
             Part("attitudes-tuned", "Attitudes from pictures", RENDERED, TUNED),
+            Part("attitudes-used-kept", "Joints with them", RENDERED, KEPT),
             Part("joined", "No log, stature stated", RENDERED, f"two {TUNED}"),
             Part("detectors", "Detectors", REAL, ""),
         ),
@@ -85,10 +86,7 @@ SECTIONS = (
         "Several people",
         "Coverage is the share of times at which two cameras see somebody and a reconstructed person is"
         " within 0.5 m. Switches, phantoms and IDF1 are those of metrics.json.",
-        (
-            Part("people", "Scenes with three drones", MODELLED, KEPT),
-            Part("people-films", "The same scenes, filmed", RENDERED, KEPT),
-        ),
+        (Part("people", "Scenes with three drones", MODELLED, KEPT),),
     ),
     Section(
         "Mistakes in flight.yaml",
