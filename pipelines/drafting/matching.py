@@ -498,10 +498,7 @@ def _ask_for_the_rest(
 
 
 def _find_lenses(
-    cameras: Sequence[CameraDraft],
-    of: Mapping[str, Sequence[Proposal]],
-    focal_by_film: FocalByFilm,
-    ask: Ask,
+    cameras: Sequence[CameraDraft], of: Mapping[str, Sequence[Proposal]], focal_by_film: FocalByFilm, ask: Ask
 ) -> None:
     """Find focal lengths without a calibration: by pictures, else by subtitles or EXIF, else by asking."""
     flown = [c for c in of.get("pose", []) if isinstance(c, FlownPoses) and c.focal_35_mm]

@@ -198,13 +198,7 @@ def _is_rivalled(view: Float, used: Bool, camera: Float, pairs: Int64, gate2: fl
 
 @helper
 def _consensus(
-    view: Float,
-    seen: Bool,
-    used: Bool,
-    camera: Float,
-    pairs: Int64,
-    gate2: float,
-    cos2_min: float,
+    view: Float, seen: Bool, used: Bool, camera: Float, pairs: Int64, gate2: float, cos2_min: float
 ) -> tuple[float, float, float, int]:
     """Find the best point of all pairs of views by truncated cost over all views; refine it on inliers."""
     best = math.inf

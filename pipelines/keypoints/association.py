@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64, best_pairs, known_median
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
-from pipelines.keypoints.bodies import (
-    SAME_BODY_M,
-    Bodies,
-    SightLines,
-    find_bodies,
-    meeting_points,
-    rays_of,
-)
+from pipelines.keypoints.bodies import SAME_BODY_M, Bodies, SightLines, find_bodies, meeting_points, rays_of
 
 # Within 3 sigma of the logged actor counts for a track, beyond it against the track.
 _NEAR_CHI2 = 9.0

@@ -12,9 +12,17 @@ from pipelines.geometry.arrays import Bool, Float, Index, Int64
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, body_model
 from pipelines.geometry.noise import UNKNOWN_SIGMA
 from pipelines.geometry.poses import interpolate_poses
-from pipelines.geometry.rig import BONES, CENTRES
+from pipelines.geometry.rig import BONES, CENTRES, unit
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
-from pipelines.reconstruction.body_fit import BodyFit, Landmarks, Rays, fit_body, landmarks_of
+from pipelines.reconstruction.body_fit import (
+    TRUNK,
+    BodyFit,
+    Landmarks,
+    Rays,
+    fit_body,
+    landmarks_of,
+    side_view_errors,
+)
 from pipelines.reconstruction.observations import Observations
 from pipelines.reconstruction.one_camera import (
     STATED_STATURE_SIGMA_M,
@@ -31,6 +39,11 @@ from pipelines.session.tables import BODY_ROTATION_COLUMNS, load_bodies
 TWO_RAYS_VARIANCE = 2.5 / 3
 # Two rays that are parallel to 5 degrees show no depth: 2 * 2 * sin(5 deg)^2 is more.
 _MIN_DETERMINANT = 0.02
+# Errors in pictures grow with this power of the inverse confidence, on the tuning flights: a joint of
+# confidence 0.5 errs 3.5 times as much as a sure one.
+_CONFIDENCE_POWER = 1.8
+# What a detector hardly sees has this confidence at least.
+_MIN_CONFIDENCE = 0.05
 # A joint whose covariance is infinite has this variance per axis.
 _UNKNOWN_M2 = 1e4
 # Surfaces are compared at this many times at most: a surface takes 3 ms.
@@ -65,9 +78,9 @@ def _errors(
 
     A joint's covariance holds errors of the camera poses, which move all joints of a person together. Its own
     error is the detector's, which errs by so much of a body in every picture: with unit vectors d along the
-    inliers' rays, the inverse of the sum of I - d d^T times a variance, or the whole where that is smaller.
-    The mean of what is left is common. A person who is nearer than thought looks larger: such an error along
-    a ray, relative to the distance, is the scale's.
+    inliers' rays, the inverse of the sum of I - d d^T over variances. The mean of what the whole has more is
+    common. A person who is nearer than thought looks larger: such an error along a ray, relative to the
+    distance, is the scale's.
     """
     start = first_row[times]
     rows = start[:, None] + columns
@@ -75,15 +88,19 @@ def _errors(
     distance = np.linalg.norm(away, axis=-1, keepdims=True)
     ray = away / distance
     across = np.nan_to_num(np.eye(3) - ray[..., None] * ray[..., None, :])  # [N, C, 3, 3]
-    normal = np.einsum("nkc,ncij->nkij", result.inlier[rows].astype(np.float64), across)
-    sure = np.linalg.det(normal) > _MIN_DETERMINANT
+    trunk = result.points[rows[:, [landmarks.joints.index(name) for name in TRUNK]]]
+    hips, shoulders = (unit(trunk[:, k] - trunk[:, k + 1])[:, None] for k in (0, 2))
+    inlier = result.inlier[rows].astype(np.float64)
+    error = np.swapaxes(side_view_errors(landmarks, hips, shoulders, ray), 1, 2)
+    weight = inlier * (np.maximum(views.weight[rows], _MIN_CONFIDENCE) / error) ** 2
+    normal, weighted = (np.einsum("nkc,ncij->nkij", each, across) for each in (inlier, weight))
+    sure = (np.linalg.det(normal) > _MIN_DETERMINANT)[..., None, None]
     variance = (MEAN_SHAPE[0] * landmarks.picture_sigma) ** 2 / TWO_RAYS_VARIANCE
     whole = result.covariance[rows]
-    own = np.linalg.inv(np.where(sure[..., None, None], normal, np.eye(3))) * variance[:, None, None]
-    smaller = sure & ~(np.trace(own, axis1=-2, axis2=-1) > np.trace(whole, axis1=-2, axis2=-1))
-    own = np.where(smaller[..., None, None], own, whole)
+    own = np.where(sure, np.linalg.inv(np.where(sure, weighted, np.eye(3))) * variance[:, None, None], whole)
     unknown = ~np.isfinite(own).all(axis=(-1, -2), keepdims=True)
-    covariance = whole - own
+    less = np.trace(own, axis1=-2, axis2=-1) > np.trace(whole, axis1=-2, axis2=-1)
+    covariance = np.where(less[..., None, None], 0.0, whole - own)
     finite = np.asarray(np.isfinite(covariance).all(axis=(-1, -2)))
     total = np.where(finite[..., None, None], covariance, 0.0).sum(axis=1)
     mean = total / np.maximum(finite.sum(axis=1), 1)[:, None, None]
@@ -178,7 +195,7 @@ def _rays_of(observations: Observations, person: int, columns: Index, seen: Bool
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     ray = np.einsum("tij,tkj->tki", np.nan_to_num(observations.rotation[:, 0]), ray)
     confidence = observations.confidence[:, person, columns, 0]
-    sigma = 1 / np.where(seen, confidence, 1.0)
+    sigma = np.where(seen, confidence, 1.0) ** -_CONFIDENCE_POWER
     camera, moment = observations.position[:, 0].copy(), np.arange(len(seen))
     posed = np.isfinite(camera).all(axis=1)
     for axis in range(3) if posed.any() else ():  # bodies go on through short gaps of the log

@@ -39,7 +39,7 @@ from pipelines.geometry.rig import BONE, BONES, PARENT, SIDES, unit
 _TABLE = Path(__file__).parent / "data" / "landmarks.csv"
 
 # The trunk's joints give the first pose.
-_TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 # With fewer joints, limbs would be of the prior alone.
 MIN_LANDMARKS = 10
 # A detector misplaces landmarks for as long as a posture lasts: with moments so far apart, errors of statures
@@ -58,7 +58,7 @@ _AMPLITUDE_STEPS = 3
 _BOUND_RAD = np.radians(5.0)
 # Who crouches or lies is far from usual in many joints: a joint beyond so many standard deviations has less
 # than half of its weight.
-_USUAL_CAUCHY = 2.0
+_USUAL_CAUCHY = 1.0
 # A relaxed arm bends its elbow by so much, degrees.
 _USUAL_ELBOW_DEG = -20.0
 # No landmark is surer than this, whatever a covariance says.
@@ -66,7 +66,7 @@ _LEAST_SIGMA_M = 1e-3
 # Nearly parallel rays leave a landmark's depth open: beyond this it has no weight, and stays finite.
 _MOST_SIGMA_M = 100.0
 # A trunk that is shorter or narrower than this has no directions.
-_LEAST_TRUNK_M = 0.02
+_LEASTTRUNK_M = 0.02
 # A landmark that a step puts behind the camera counts as this far before it.
 _LEAST_DEPTH_M = 0.3
 # A longer step leaves the range of the linear model.
@@ -90,6 +90,17 @@ _RANGES_DEG: dict[str, tuple[tuple[float, float], ...]] = {
 """Rotation of a left bone against its parent about x (forward), y (left) and z (up), degrees from the
 neutral pose. American Academy of Orthopaedic Surgeons (1965): thoracolumbar 80/25, 35 and 45 deg and cervical
 45/45, 45 and 60 deg, each divided among its bones; right limbs are mirrored."""
+
+_SIDE_VIEW: dict[str, tuple[float, float]] = {
+    "clavicle": (2.8, 2.8),
+    "upper_arm": (1.8, 3.0),
+    "hand": (1.0, 5.0),
+    "pelvis": (1.8, 2.5),
+    **dict.fromkeys(("thigh", "shank", "foot", "toes"), (1.0, 1.6)),
+}
+"""Ratio of errors in pictures from the side to the table's, on the near side and the far one, on the tuning
+flights. A detector puts both shoulders, and both hips, halfway between them there, and a hidden hand onto the
+other one."""
 
 
 @dataclass(frozen=True)
@@ -130,11 +141,29 @@ def landmarks_of(joints: Sequence[str]) -> tuple[Landmarks, Index] | None:
     table = _tables()["blazepose" if "left_mouth" in joints else "coco"]
     kept = np.array([k for k, name in enumerate(table.joints) if name in joints], dtype=np.intp)
     names = [table.joints[k] for k in kept.tolist()]
-    if len(kept) < MIN_LANDMARKS or not set(_TRUNK).issubset(names):
+    if len(kept) < MIN_LANDMARKS or not set(TRUNK).issubset(names):
         return None
     columns = np.array([list(joints).index(name) for name in names], dtype=np.intp)
     spread = table.body_sigma[kept], table.modes[kept], table.picture_sigma[kept]
     return Landmarks(tuple(names), table.bone[kept], table.offset[kept], *spread), columns
+
+
+def side_view_errors(landmarks: Landmarks, hips: Float, shoulders: Float, ray: Float) -> Float:
+    """Return the ratios [..., K] of errors in pictures from any direction to the table's, see `_SIDE_VIEW`.
+
+    All [..., 3] have length 1: from the right hip to the left one, the same of shoulders, and the ray. NaN
+    counts as a picture from the front.
+    """
+    found = []
+    for joint, bone in zip(landmarks.joints, landmarks.bone.tolist(), strict=True):
+        side = joint.partition("_")[0]
+        part = BONES[bone].removeprefix(f"{side}_")
+        near, far = _SIDE_VIEW.get(part, (1.0, 1.0))
+        across = shoulders if part in ("clavicle", "upper_arm", "hand") else hips
+        away = np.nan_to_num(np.sum(across * ray, axis=-1)) * (1.0 if side == SIDES[0] else -1.0)
+        # Nearer to the front than 45 deg errors are those of the front.
+        found.append(1 + (np.where(away > 0, far, near) - 1) * away**4)
+    return np.stack(found, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -254,11 +283,11 @@ def fit_body(
     for constant. The body has all times with both hips, both shoulders and ten landmarks.
     """
     known = np.asarray(np.isfinite(place).all(axis=-1))
-    trunk = [landmarks.joints.index(name) for name in _TRUNK]
+    trunk = [landmarks.joints.index(name) for name in TRUNK]
     left_hip, right_hip, left_shoulder, right_shoulder = (place[:, k] for k in trunk)
     sides = left_hip - right_hip, left_shoulder - right_shoulder, left_shoulder - left_hip
     whole = known[:, trunk].all(axis=1) & (known.sum(axis=1) >= MIN_LANDMARKS)
-    whole &= np.min([np.linalg.norm(side, axis=1) for side in sides], axis=0) > _LEAST_TRUNK_M
+    whole &= np.min([np.linalg.norm(side, axis=1) for side in sides], axis=0) > _LEASTTRUNK_M
     (row,) = np.nonzero(whole)
     if not len(row):
         return None

@@ -36,7 +36,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-from pipelines.geometry.rig import BONE, BONES, SIDES
+from pipelines.geometry.rig import BONE, BONES, SIDES, unit
 from pipelines.reconstruction.body_fit import (
     MIN_LANDMARKS,
     BodyFit,
@@ -51,6 +51,7 @@ from pipelines.reconstruction.body_fit import (
     joint_ranges,
     settle,
     shared_prior,
+    side_view_errors,
 )
 
 STATURE_M = (float(MEAN_SHAPE[0]), 0.08)
@@ -90,9 +91,6 @@ _BONE_RADPS2 = {
     "forearm": 40.0,
     "shank": 35.0,
 }
-# Limbs that could as well point the other way err more than derivatives say. With it the NEES of joints is 3
-# on the tuning flights.
-_WIDENED = 1.3
 # Mean cost of a landmark where the detector errs as usual, on the tuning flights: 0.06 to 0.12.
 _USUAL_MISFIT = 0.12
 # A detector fails for about as long: covariances grow with the mean misfit of so many moments.
@@ -164,6 +162,9 @@ def fit_seen_body(
     across_m = _ALIKE * MEAN_SHAPE[0] * landmarks.picture_sigma
     rays = replace(rays, sigma=rays.sigma * across_m / distance)
     poses, level = _first_poses(points, rays, first_turns, (t_ns[row] - t_ns[row[0]]) / 1e9)
+    hips, shoulders = (poses.turn[:, BONE[name], :, 1] for name in ("pelvis", "chest"))
+    errors = side_view_errors(landmarks, hips, shoulders, unit(poses.root - rays.camera))
+    rays = replace(rays, sigma=rays.sigma * errors)
     shared = Shared(points.prior.mean[:12].copy(), np.zeros((len(landmarks.bone), 3)), level)
     found = _fit_windows(points, t_ns, row, rays, poses, shared)
     known = found.body.row
@@ -197,7 +198,7 @@ def _fit_windows(
         own = _poses_of(fit.poses, inner), fit.shared, fit.covariance[inner], fit.answer[inner]
         turning, *joints = points.spread_of_joints(*own, fit.shared_covariance)
         places = points.spread(*own, fit.shared_covariance)
-        wider = _WIDENED * _misfit(points, _of(rays, part), fit)[inner, None, None, None]
+        wider = _misfit(points, _of(rays, part), fit)[inner, None, None, None]
         widened = (wider * each for each in (turning, joints[1], places[1]))
         parts.append((own[0].turn, own[0].root, *widened))
     turn, root, *covariances = (np.concatenate(part) for part in zip(*parts, strict=True))

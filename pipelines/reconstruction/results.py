@@ -54,14 +54,7 @@ _PER_JOINT = (
     "reconstructed_share",
     "reprojection_px_mean",
 )
-_UNMEASURED = dict.fromkeys(
-    [
-        *ERRORS,
-        "root_frames_left_out",
-        "pa_frames_left_out",
-        *WORLD_ERRORS,
-    ]
-)
+_UNMEASURED = dict.fromkeys([*ERRORS, "root_frames_left_out", "pa_frames_left_out", *WORLD_ERRORS])
 """Placeholder for errors without truth."""
 
 

@@ -20,13 +20,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics, Picture, k
 from pipelines.geometry.cameras import project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.content import (
-    MeasuredMotion,
-    SessionContent,
-    estimated_clocks,
-    number,
-    section,
-)
+from pipelines.reporting.content import MeasuredMotion, SessionContent, estimated_clocks, number, section
 from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Description, Interpolation

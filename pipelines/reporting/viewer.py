@@ -20,13 +20,7 @@ from pipelines.geometry.body_model import ABOVE, BELOW, body_model
 from pipelines.geometry.poses import multiply
 from pipelines.geometry.rig import BONES
 from pipelines.reporting.arms import ArmTrack, Replan, raised_surface
-from pipelines.reporting.content import (
-    FULL_SCALE,
-    MeasuredMotion,
-    Strip,
-    middles,
-    standing_heights,
-)
+from pipelines.reporting.content import FULL_SCALE, MeasuredMotion, Strip, middles, standing_heights
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at

@@ -251,10 +251,7 @@ def measure_arm(
     return {
         "pictures": int(np.prod(inside.shape[:2])),
         "in_view_share": float(inside.all(axis=-1).mean()),
-        "tilt_deg": {
-            "mean": float(tilt_deg.mean()),
-            "max": float(tilt_deg.max()),
-        },
+        "tilt_deg": {"mean": float(tilt_deg.mean()), "max": float(tilt_deg.max())},
         "detected_share": float((sightings.confidence > 0).any(axis=-1).mean()),
         "keypoint_pck": float(near[inside].mean()) if inside.any() else None,
         "keypoint_median_px": float(np.median(measured)) if measured.size else None,

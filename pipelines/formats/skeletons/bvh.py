@@ -26,13 +26,7 @@ from pipelines.formats.common.exporting import bodies_of, people_of
 from pipelines.formats.common.files import read_head
 from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints, describe_motion
 from pipelines.geometry.arrays import Bool, Float, Int64
-from pipelines.geometry.poses import (
-    conjugate,
-    interpolate_poses,
-    matrix_from_quaternion,
-    multiply,
-    rotate,
-)
+from pipelines.geometry.poses import conjugate, interpolate_poses, matrix_from_quaternion, multiply, rotate
 from pipelines.geometry.rig import BONE, BONES, PARENT
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, MovingBody, Recording, SkeletalMotion
