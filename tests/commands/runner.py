@@ -22,13 +22,9 @@ MOCAP = str(Path(sys.executable).with_name("mocap"))
 
 
 class Done(subprocess.CompletedProcess[str]):
-    """Result of a command that ran in this process.
+    """Result of a command that ran in this process."""
 
-    Attributes:
-        code: of the error that ended it; None without one.
-    """
-
-    code: str | None = None
+    code: str | None = None  # of the error that ended it
 
 
 def mocap(*arguments: str | Path) -> Done:

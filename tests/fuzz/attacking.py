@@ -74,13 +74,10 @@ class Command:
 
 
 class Reader:
-    """Process with all readers loaded, which forks one for each input.
-
-    Args:
-        warm: paths of sound inputs with their formats, which load what the readers import late.
-    """
+    """Process with all readers loaded, which forks one for each input."""
 
     def __init__(self, warm: Sequence[tuple[str, str]] = ()) -> None:
+        # Paths of sound inputs with their formats load what the readers import late.
         self._warm = json.dumps(warm)
 
     def __enter__(self) -> Reader:

@@ -55,11 +55,7 @@ def _kind(name: str, stated: str, entry: str) -> Callable[[_Make], _Make]:
 
 
 def crafted(kinds: Collection[str] | None = None) -> Iterator[Crafted]:
-    """Yield all inputs, class by class; nothing is written yet, and large contents are made one at a time.
-
-    Args:
-        kinds: the classes; all by default.
-    """
+    """Yield all inputs, class by class; nothing is written yet, and large contents are made one at a time."""
     for kind in kinds or KINDS:
         usual_format, usual_entry, make = KINDS[kind]
         for given in make():

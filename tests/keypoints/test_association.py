@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
-from pipelines.keypoints.association import (
-    Association,
-    Surroundings,
-    associate,
-    associate_one_camera,
-)
+from pipelines.keypoints.association import Association, Surroundings, associate, associate_one_camera
 from pipelines.keypoints.bodies import SightLines
 from pipelines.keypoints.corrections import Pair, mirrored_pairs, swaps_across_views
 from pipelines.reconstruction.observations import on_sides

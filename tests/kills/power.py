@@ -51,11 +51,7 @@ _SYNCING = ("fsync", "fdatasync")
 
 
 class Recorder:
-    """Comparison of a folder with what it was, before and after each call that changes or syncs entries.
-
-    Args:
-        folder: the folder; what is in it at first is on the disk.
-    """
+    """Comparison of a folder, first all on the disk, before and after calls that change or sync entries."""
 
     def __init__(self, folder: Path) -> None:
         self.trace = [Moment({}, {}, {})]
@@ -198,12 +194,7 @@ class Lost:
 
 
 def cases_on(folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Case]]:
-    """Yield commands, each with the folder that holds all that it reads and writes.
-
-    Args:
-        folder: is filled with flights and sessions.
-        names: of the commands; all by default.
-    """
+    """Yield commands, all by default, each with the folder that holds all that it reads and writes."""
     for name, make in _CASES.items():
         if not names or name in names:
             place = folder / name.replace(" ", "_")

@@ -57,16 +57,13 @@ def formation(
 
     Args:
         times: frames of every camera, at 30 Hz.
-        cameras: number of cameras.
-        models: errors of their logs, not stated to `robust`.
-        seed: seed of all random draws.
+        models: errors of the logs, not stated to `robust`.
         pixel_px: noise of the keypoints, at f = 1500 px.
         memory: autocorrelation of that noise from one frame to the next.
         constant_px: constant error of each joint in each camera.
         bad_share: share of keypoints that are 100 to 300 px off, and share that are missing.
         still: the cameras hover around the walk instead of following it.
         variation: deviation of moving cameras from the rigid ring.
-        tilt_deg: elevation of the cameras.
         late_s: delay of each camera's pictures after their stamps (s); logs have the right time.
     """
     rng = np.random.default_rng([seed, cameras])

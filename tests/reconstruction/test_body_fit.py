@@ -29,6 +29,7 @@ from pipelines.reconstruction.body_fit import (
     fit_body,
     joint_ranges,
     landmarks_of,
+    side_view_errors,
 )
 from pipelines.reconstruction.one_camera import (
     STATURE_M,
@@ -50,16 +51,9 @@ def known_landmarks(skeleton: str = "blazepose33") -> Landmarks:
 
 
 def moving(rng: np.random.Generator) -> tuple[Poses, Float]:
-    """Return poses within the usual ranges, and a shape of the prior."""
-    ranges, t_s = joint_ranges(), np.arange(TIMES)[:, None] * 0.4
-    turn = np.zeros((TIMES, len(BONES), 3, 3))
-    turn[:, 0] = matrix_from_quaternion(quaternion_from_rotation_vector(np.hstack([0.1 * t_s, 0 * t_s, t_s])))
-    for k, (bone, parent) in enumerate(zip(ranges.bone, ranges.parent, strict=True)):
-        vector = ranges.usual[k] + 0.1 * ranges.half[k] * np.sin(2 * t_s + rng.uniform(0, 6.28, 3))
-        relative = matrix_from_quaternion(quaternion_from_rotation_vector(vector))
-        turn[:, bone] = turn[:, parent] @ ranges.middle[k] @ relative
-    root = np.hstack([t_s, 0 * t_s, 0 * t_s + 1.0])
-    return Poses(root, turn), MEAN_SHAPE + SHAPE_SIGMA * rng.normal(size=len(MEAN_SHAPE))
+    """Return poses of a walk, and a shape of the prior."""
+    t_s = np.arange(TIMES, dtype=np.float64) * 0.4
+    return Poses(np.outer(t_s, [1.0, 0.0, 0.0]), walking(t_s)), MEAN_SHAPE + SHAPE_SIGMA * rng.normal(size=12)
 
 
 def errors_of(own: Float, rows: Index, scale: float = 0.0) -> tuple[Float, Float, Float]:
@@ -111,6 +105,50 @@ def test_modes_of_landmarks_count_as_their_covariance_does() -> None:
     _, cost, shift = _bounded(white, modes)
     np.testing.assert_allclose(cost, (error.mT @ precision @ error).ravel(), rtol=1e-5)
     np.testing.assert_allclose(_less(shift, _less(shift, unit)), precision, atol=1e-5)
+
+
+def test_modes_that_move_in_a_walk_are_found_within_their_standard_deviations() -> None:
+    rng, landmarks, t_s = np.random.default_rng(3), known_landmarks(), np.arange(60) / 3
+    points, many = Points(body_model(), landmarks), landmarks.modes.shape[-1]
+    poses, shared = (
+        Poses(np.outer(t_s, [0.4, 0.3, 0.0]), walking(t_s)),
+        Shared(MEAN_SHAPE, 0 * landmarks.offset),
+    )
+    amplitude = 1.4 * np.sin(t_s[:, None] * rng.uniform(1.0, 4.0, many) + rng.uniform(0.0, 6.3, many))
+    moved = np.einsum("tkij,kjm,tm->tki", poses.turn[:, landmarks.bone], landmarks.modes, amplitude)
+    sigma_m = MEAN_SHAPE[0] * landmarks.picture_sigma[:, None] / 2
+    place = places(points, poses, shared) + MEAN_SHAPE[0] * moved
+    place += sigma_m * rng.normal(size=place.shape)
+    own = np.tile(sigma_m[..., None] ** 2 * np.eye(3), (len(t_s), 1, 1, 1))
+    body = fit_body(landmarks, np.round(t_s * 1e9).astype(np.int64), place, partial(errors_of, own))
+    assert body is not None
+
+    # One system of amplitudes and the fitted poses, which have the fit's prior.
+    fitted, seen = Poses(body.centre[:, 0], matrix_from_quaternion(body.rotation)), _seen(place, own)
+    shared = Shared(body.shape, shared.offset)
+    *_, slope, shift = points._whitened(fitted, seen, shared)
+    prior = points.normal(fitted, seen, shared, whole=False).pose - slope.mT @ slope
+    slope = np.linalg.inv(np.eye(slope.shape[1]) - shift @ shift.mT) @ slope
+    modes = body.shape[0] * seen.root_weight @ fitted.turn[:, landmarks.bone] @ landmarks.modes
+    both = np.concatenate([slope, modes.reshape(len(t_s), -1, many)], axis=2)
+    precision = both.mT @ both + np.eye(69 + many) * (np.arange(69 + many) >= 69)
+    precision[:, :69, :69] += prior
+    white = (seen.root_weight @ (place - places(points, fitted, shared))[..., None]).reshape(len(t_s), -1, 1)
+    error = np.linalg.solve(precision[:, 69:, 69:], both[..., 69:].mT @ white)[..., 0] - amplitude
+    error -= error.mean(axis=0)  # offsets of the body are constant, too
+    white = np.linalg.solve(np.linalg.inv(precision)[:, 69:, 69:], error[..., None])[..., 0]
+    # The mean of 360 squares of standard normal numbers errs by 0.075.
+    assert np.mean(error * white) == pytest.approx(1.0, abs=0.3)
+
+
+def test_far_limbs_err_more_in_pictures_from_the_side() -> None:
+    landmarks, left = known_landmarks(), np.array([0.0, 1.0, 0.0])
+    rays = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [np.nan, 0.0, 0.0]])
+    front, from_right, from_left, unknown = side_view_errors(landmarks, left, left, rays)
+    assert (front == 1).all()
+    assert (unknown == 1).all()
+    one, other = (landmarks.joints.index(f"{side}_wrist") for side in ("left", "right"))
+    assert from_right[one] == from_left[other] > from_right[other] == from_left[one] == 1
 
 
 @pytest.fixture(scope="module")
@@ -198,17 +236,8 @@ def test_one_camera_places_a_person_as_well_as_it_says(
     The stature is known to 8 cm, which is 0.4 m of the distance; a ground that is known makes that 0.25 m.
     """
     rng, landmarks, t_s = np.random.default_rng(1), known_landmarks(), np.arange(60) / 12
-    points, usual = StandingPoints(landmarks, GroundHeight(flat, level_sigma_m), STATURE_M), joint_ranges()
-    turn = np.zeros((len(t_s), len(BONES), 3, 3))
-    turn[:, 0] = matrix_from_quaternion(quaternion_from_rotation_vector(np.outer(t_s / 4, [0, 0, 1.0])))
-    stride = {"left_thigh": 1, "right_thigh": -1, "left_upper_arm": -1, "right_upper_arm": 1}
-    for k, (bone, parent) in enumerate(zip(usual.bone, usual.parent, strict=True)):
-        vector = np.tile(usual.usual[k], (len(t_s), 1))
-        vector[:, 1] += 0.4 * stride.get(BONES[bone], 0) * np.sin(6 * t_s)
-        if "shank" in BONES[bone]:
-            vector[:, 1] += 0.3 * (1 + np.sin(6 * t_s + (2 if "left" in BONES[bone] else 5)))
-        relative = matrix_from_quaternion(quaternion_from_rotation_vector(vector))
-        turn[:, bone] = turn[:, parent] @ usual.middle[k] @ relative
+    points = StandingPoints(landmarks, GroundHeight(flat, level_sigma_m), STATURE_M)
+    turn = walking(t_s)
     shape = MEAN_SHAPE + 0.5 * SHAPE_SIGMA * rng.normal(size=len(MEAN_SHAPE))
     shape[0] = 1.76
     soles = np.tensordot([1.0, *shape[1:]], points.contacts, 1)
@@ -248,6 +277,21 @@ def test_one_camera_places_a_person_as_well_as_it_says(
     short = fit_seen_body(landmarks, t_ns[:2], two, points.ground, STATURE_M, exact[:2])
     assert short is not None
     assert np.isfinite(short.body.centre).all()
+
+
+def walking(t_s: Float) -> Float:
+    """Return world rotations [T, 22, 3, 3] of somebody who walks on a curve."""
+    usual, turn = joint_ranges(), np.zeros((len(t_s), len(BONES), 3, 3))
+    turn[:, 0] = matrix_from_quaternion(quaternion_from_rotation_vector(np.outer(t_s / 4, [0, 0, 1.0])))
+    stride = {"left_thigh": 1, "right_thigh": -1, "left_upper_arm": -1, "right_upper_arm": 1}
+    for k, (bone, parent) in enumerate(zip(usual.bone, usual.parent, strict=True)):
+        vector = np.tile(usual.usual[k], (len(t_s), 1))
+        vector[:, 1] += 0.4 * stride.get(BONES[bone], 0) * np.sin(6 * t_s)
+        if "shank" in BONES[bone]:
+            vector[:, 1] += 0.3 * (1 + np.sin(6 * t_s + (2 if "left" in BONES[bone] else 5)))
+        relative = matrix_from_quaternion(quaternion_from_rotation_vector(vector))
+        turn[:, bone] = turn[:, parent] @ usual.middle[k] @ relative
+    return turn
 
 
 def flat(at: Float) -> Float:

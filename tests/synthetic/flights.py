@@ -82,10 +82,6 @@ def write_flight(
     <camera>_true.tum, or calibration.toml for static cameras. Cameras are called drone1, drone2, ...
 
     Args:
-        folder: created if it does not exist.
-        cameras: number of cameras.
-        seconds: length; the number of frames is rounded.
-        fps: frames per second of every camera.
         clean: no noise at all. Two errors remain: the rounding of pixels to 0.001, 0.01 mm at 10 m, and
             the interpolation of poses, 3 micrometres.
         static: the cameras stand still, and their poses come from a calibration in Pose2Sim's format.
@@ -93,7 +89,6 @@ def write_flight(
         pose_noise: noise of the logs as stated in flight.yaml, unless clean; static cameras: a bias alone.
         keypoint_format: alphapose, coco or openpose (with COCO's joints).
         pose_format: tum or csv.
-        seed: seed of all noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     detector = CLEAN_KEYPOINTS if clean else USUAL_KEYPOINTS

@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -72,12 +71,6 @@ def peak_mb() -> float:
     status = Path("/proc/self/status").read_text(encoding="ascii")
     (peak,) = (line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:"))
     return int(peak) / 1024
-
-
-def with_rosbags(log: Path) -> int:
-    """Read the bytes of every message with rosbags; return the count of messages with content."""
-    with AnyReader([log]) as reader:
-        return sum(len(data) > 0 for _, _, data in reader.messages())
 
 
 def decoded(log: Path) -> int:

@@ -65,13 +65,11 @@ def walk(
     speed stays within 15 % of its mean.
 
     Args:
-        t_s: [T] times, seconds, in any order.
-        speed_mps: mean speed of the pelvis along the path, at least 0.
+        t_s: [T] times, in any order.
         start: east and north of the pelvis at time 0, metres, up to its forward sway of 7 mm.
         heading_deg: direction of the walk at time 0, counterclockwise from east.
         radius_m: radius of a circle that begins at `start` and turns left; straight without it. The
             whole body turns with the path, which twists the feet on the ground.
-        height_m: height of the body.
 
     Returns:
         [T, 17, 3] metres, ENU, the ground at z = 0, joints in the order of `COCO17`.
@@ -168,9 +166,7 @@ def _sole_centre(joints: dict[str, Float], side: str) -> Float:
 
 @cache
 def _pelvis_travel() -> tuple[float, NDArray[np.complex128]]:
-    """Compute the phase per body height that the pelvis travels, and its sway (Fourier series).
-
-    The sway is about the mean speed.
+    """Compute the phase per body height that the pelvis travels, and its sway about that (Fourier series).
 
     The pelvis goes forward as fast as the soles roll, each weighed by how much it carries (the
     derivative of the pelvis height by its drop). Integrated as a Fourier series: exact for a period.
