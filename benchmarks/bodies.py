@@ -6,7 +6,7 @@ shape held: keypoints do not show how stout somebody is, so this bounds what the
 one by itself, without a stated stature; with true poses once more with the true ground, because the map's
 voxels of 0.25 m show its height to 0.13 m. "Landmarks" are the skeleton's shoulders, elbows, hips, knees and
 ankles against the true joint centres, "centres" those of the body; both relative to the middle of the hips.
-NEES is that of vertices, by the covariances in body.parquet.
+NEES is that of vertices, by body.parquet. Chi squared of three is above 4.5 in 21 % of flights, 7.8 in 5 %.
 """
 
 import argparse
@@ -94,9 +94,9 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
         stature = np.abs(table[:, 0])
         cells = [f"{stature.mean():.0f} ({np.median(stature):.0f})"]
         cells += [f"{mean[k]:.0f} ({middle[k]:.0f})" for k in range(2, 6)]
-        rows.append([case, str(len(own)), *cells, f"{mean[6]:.1f} ({middle[6]:.1f})"])
-    header = ["case", "bodies", "stature mm: mean (median)", "MPVPE"]
-    header += ["MPVPE root-relative", "landmarks root-relative", "centres root-relative", "NEES"]
+        rows.append([case, str(len(own)), *cells, f"{mean[6]:.1f} ({table[:, 6].max():.1f})"])
+    header = ["case", "bodies", "stature mm: mean (median)", "MPVPE", "MPVPE root-relative"]
+    header += ["landmarks root-relative", "centres root-relative", "NEES: mean (largest)"]
     yield "bodies", markdown_table(header, rows)
 
 
