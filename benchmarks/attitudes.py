@@ -21,7 +21,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -104,7 +103,9 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
     names = options.flights or (KEPT if options.kept else TUNED)
     if options.used is not None:
         columns = ["log", "reconstructed", "logged, other mm", "ratio", "by draw: median, largest", "NEES"]
-        rows = [used(options.flights or names[:-1], log, options.draws) for log in options.used or USED]
+        # Of two people without logs, either may be the only one.
+        alone = [e.name for e in flights() if e.name in names[:-1] and len(e.scenario.people) == 1]
+        rows = [used(options.flights or alone, log, options.draws) for log in options.used or USED]
         yield f"attitudes-used-{'kept' if options.kept else 'tuned'}", markdown_table(columns, rows)
         return
     heading = ["flight", "camera", "moves m", "refused", "rtk: off (bound)", "NEES", "gps: off deg", "NEES"]
@@ -205,7 +206,6 @@ def used(names: Sequence[str], log: str, draws: int) -> list[str]:
                     other[name] = by.trajectory, by.pose_noise
             sessions = [_session_of(drawn, Path(folder) / str(k), of) for k, of in enumerate((logged, other))]
             found.append([_outcome(flight, session) for session in sessions])
-            print(flight.name, log, draw, found[-1], file=sys.stderr, flush=True)
     if not found:
         return [log, f"0/{draws}", *4 * ["-"]]
     (first, nees), (second, others) = np.mean(found, axis=0)
