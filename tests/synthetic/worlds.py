@@ -237,7 +237,7 @@ def _beside(rng: np.random.Generator, world: World) -> Solid:
     return Box((float(place[0]), float(place[1]), high / 2), (long / 2, thick / 2, high / 2), yaw)
 
 
-def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
+def fly(seed: int, arms: Sequence[str] = ARMS, config: PlannerConfig = _CONFIG) -> list[dict[str, Any]]:
     """Fly all arms through one world; return figures of each flight, measured on the analytic surfaces."""
     world = world_of(seed)
     field = world.field()
@@ -249,13 +249,13 @@ def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
             world.actor,
             [field],
             Start(world.drones, world.yaw_rad),
-            config=_CONFIG,
+            config=config,
         )
         place = _finely(result.position)
         slots_now = world.actor[0] + (result.position[:, 0] - result.actor[0])
-        figures = score(result.t_s, result.position, result.actor, field, _CONFIG)
-        seen = seen_actor(result.position, result.actor, field, _CONFIG)[None]
-        error = errors_of_views(result.position, result.actor[None], seen, _CONFIG).clip(0, _MOST_ERROR_M)
+        figures = score(result.t_s, result.position, result.actor, field, config)
+        seen = seen_actor(result.position, result.actor, field, config)[None]
+        error = errors_of_views(result.position, result.actor[None], seen, config).clip(0, _MOST_ERROR_M)
         broken = figures["limit_violations"]
         assert isinstance(broken, dict)
         away_m, tilt_rad = slot_of(result.position - result.actor)[..., [2, TILT]].T
@@ -288,12 +288,12 @@ def _finely(position: Float) -> Float:
     return np.concatenate([between.reshape(len(position), -1, 3), position[:, -1:]], axis=1)
 
 
-def flown(seeds: Iterable[int], workers: int, arms: Sequence[str]) -> Iterable[dict[str, Any]]:
+def flown(seeds: Iterable[int], workers: int, arms: Sequence[str], config: PlannerConfig) -> Iterable[Any]:
     """Fly some worlds; yield their flights in the order of their seeds."""
     if workers == 1:
         for seed in seeds:
-            yield from fly(seed, arms)
+            yield from fly(seed, arms, config)
         return
     with ProcessPoolExecutor(workers) as pool:
-        for rows in pool.map(partial(fly, arms=arms), seeds):
+        for rows in pool.map(partial(fly, arms=arms, config=config), seeds):
             yield from rows
