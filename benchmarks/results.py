@@ -110,7 +110,7 @@ SECTIONS = (
         " flown; by keypoints: the model with those of the films. Worlds to 14 set the model's deviations.",
         (
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
-            Part("planner-worlds", "Random worlds", MODELLED, ""),
+            Part("planner-worlds", "Random worlds", MODELLED, KEPT),
             Part("planner-films", "Modelled and filmed differences", RENDERED, "kept aside from world 15 on"),
             Part("planner-filming", "View quality of published plans, and of ours", REAL, ""),
             Part("planner-groups", "Groups that split", MODELLED, KEPT),
