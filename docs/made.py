@@ -309,6 +309,7 @@ def figures() -> str:
 def _cells(name: str, words: int) -> dict[str, dict[str, str]]:
     """Read a table of docs/results.json: its rows by their first cells, each by the header."""
     lines = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))[name]["lines"]
+    lines = [line for line in lines if line.startswith("|")]
     header, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
     return {" ".join(row[:words]): dict(zip(header, row, strict=True)) for row in rows}
 
