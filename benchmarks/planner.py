@@ -88,8 +88,8 @@ def worlds(options: argparse.Namespace) -> Lines:
         error = every.pivot(index=["seed", "range_m"], columns="arm", values="error_m")
         more = (error["joint"] / error["adaptive"] - 1).groupby("seed").agg(["mean", "sem"])
         worse = [(more["mean"] > least).sum() for least in (0.01, np.fmax(2 * more["sem"], 0.01))]
-        where = f"{worse[0]} of {len(more)} worlds, and by two standard errors in {worse[1]}"
-        lines += ["", f"`joint` is predicted to err by over 1 % more than `adaptive` in {where}."]
+        where = f"{worse[0]} of {len(more)} worlds, by two standard errors in {worse[1]}"
+        lines += ["", f"`joint` errs by over 1 % more than `adaptive` in {where}."]
     return sys.exit("\n".join([*lines, *trouble])) if trouble else lines
 
 

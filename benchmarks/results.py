@@ -93,7 +93,7 @@ SECTIONS = (
         "Each flight is described with one mistake. It counts if the error grows by more than 20 %."
         " Named: the first doubt has the right code. Mended: its remedy brings the error within 10 % of"
         " the right one. Fitted: it states poses with standard deviations; true: within two of these. Made"
-        " worse: a remedy, right or wrong, raises the error or the misfit.",
+        " worse: a remedy raises error or misfit.",
         (
             Part("mistakes-kept", "Mistakes named and mended", MODELLED, KEPT),
             Part("mistakes-tuned", "Mistakes named and mended", MODELLED, TUNED),
@@ -105,9 +105,8 @@ SECTIONS = (
     ),
     Section(
         "Planner",
-        "Flights are closed loops of point masses. Tilt is the elevation of cameras above the person."
-        " Errors are those of joints that all arms measured. Differences: `adaptive` less the flight as"
-        " flown; by keypoints: the model with those of the films. Worlds to 14 set the model's deviations.",
+        "Errors are those of joints that all arms measured. Differences: `adaptive` less the flight as flown;"
+        " by keypoints: the model with those of the films. Worlds to 14 set the model's deviations.",
         (
             Part("filmed", "The paper's experiments, filmed", RENDERED, ""),
             Part("planner-worlds", "Random worlds", MODELLED, KEPT),

@@ -401,9 +401,6 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
         assert np.array_equal(shuffled.chosen(result, person), CROWD.chosen(CROWD_RESULT[0], person))
 
 
-BESIDE = straight((-3.0, 1.5), (1.0, 0.0))
-
-
 def test_people_are_told_apart_under_constant_pose_errors() -> None:
     """Let three people cross, with 3 cameras, 0.3 m and 1 deg: 0.0035 of the choices are wrong."""
     across = straight((0.5, -3.0), (0.0, 1.1))
