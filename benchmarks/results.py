@@ -178,7 +178,7 @@ def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
         "# Results",
         "",
         *_words(
-            "All figures, with kind, command (or that above), date and commit."
+            "All figures, with kind, command, date and commit."
             " `python -m benchmarks.results` measures the sample again and writes this page; the other"
             " commands replace their tables with `--write`. No constant was chosen because of flights kept"
             " aside. Closed loops of planners amplify rounding: other processors change their figures by up"

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import yaml  # type: ignore[import-untyped]
+from rosbags.highlevel import AnyReader
 
 from benchmarks.flights import SAMPLE, scenario_of
 from benchmarks.flights import walker as person
@@ -96,19 +97,15 @@ def _points_row(what: str, took_s: float, points: Float, truth: Float) -> Row:
     return what, f"{len(truth) / took_s / 1e6:.2f} M joint-frames/s", f"{error_mm:.2f} mm"
 
 
-def projections(views: Views) -> Float:
-    """Compute projection matrices camera_from_world [F, C, 3, 4]."""
-    camera_from_world = np.swapaxes(views.rotation, -1, -2)
-    return np.concatenate([camera_from_world, -camera_from_world @ views.position[..., None]], axis=-1)
-
-
 def pycolmap_ransac(views: Views) -> Float:
     """Triangulate with pycolmap's robust method and a gate of 15 px, one call per joint-frame."""
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1920, height=1080, params=[FOCAL, 960, 540])
     options = pycolmap.EstimateTriangulationOptions()
     options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
     options.ransac.max_error = 15.0
-    poses = [[pycolmap.Rigid3d(p) for p in row] for row in projections(views)]
+    turned = np.swapaxes(views.rotation, -1, -2)
+    projections = np.concatenate([turned, -turned @ views.position[..., None]], axis=-1)
+    poses = [[pycolmap.Rigid3d(p) for p in row] for row in projections]
     pixels = views.rays * FOCAL + [960, 540]
     points = np.full((len(pixels), 3), np.nan)
     for n, seen in enumerate(np.isfinite(pixels.sum(axis=2))):
@@ -159,6 +156,12 @@ def refinement() -> Iterator[Row]:
 # --- logs ------------------------------------------------------------------------------------------------
 
 
+def with_rosbags(log: Path) -> int:
+    """Read the bytes of every message with rosbags; return the count of messages with content."""
+    with AnyReader([log]) as reader:
+        return sum(len(data) > 0 for _, _, data in reader.messages())
+
+
 def logs() -> Iterator[Row]:
     """Time the ingest of logs, and rosbags' raw iteration, each in a process of its own."""
     for container in recorder_logs.CONTAINERS:
@@ -167,12 +170,10 @@ def logs() -> Iterator[Row]:
                 recorder_logs.write(Path(folder) / str(mb), container, recorder_logs.RECORDER, 60_000, mb)
                 for mb in (1, 200)
             )
+            timed = partial(recorder_logs.in_a_process, recorder_logs.timed)
             raw, own = (
-                min(
-                    (recorder_logs.in_a_process(recorder_logs.timed, run, small, large) for _ in range(3)),
-                    key=lambda figures: float(figures["seconds"]),
-                )
-                for run in (recorder_logs.with_rosbags, recorder_logs.ingested)
+                min((timed(run, small, large) for _ in range(3)), key=lambda found: float(found["seconds"]))
+                for run in (with_rosbags, recorder_logs.ingested)
             )
         said = f"rosbags, raw: {raw['seconds']:.2f} s"
         yield f"ingest of {container}, 200 MB", f"{own['seconds']:.2f} s, {own['peak_mb']:.0f} MB", said
