@@ -66,7 +66,7 @@ _LEAST_SIGMA_M = 1e-3
 # Nearly parallel rays leave a landmark's depth open: beyond this it has no weight, and stays finite.
 _MOST_SIGMA_M = 100.0
 # A trunk that is shorter or narrower than this has no directions.
-_LEASTTRUNK_M = 0.02
+_LEAST_TRUNK_M = 0.02
 # A landmark that a step puts behind the camera counts as this far before it.
 _LEAST_DEPTH_M = 0.3
 # A longer step leaves the range of the linear model.
@@ -287,7 +287,7 @@ def fit_body(
     left_hip, right_hip, left_shoulder, right_shoulder = (place[:, k] for k in trunk)
     sides = left_hip - right_hip, left_shoulder - right_shoulder, left_shoulder - left_hip
     whole = known[:, trunk].all(axis=1) & (known.sum(axis=1) >= MIN_LANDMARKS)
-    whole &= np.min([np.linalg.norm(side, axis=1) for side in sides], axis=0) > _LEASTTRUNK_M
+    whole &= np.min([np.linalg.norm(side, axis=1) for side in sides], axis=0) > _LEAST_TRUNK_M
     (row,) = np.nonzero(whole)
     if not len(row):
         return None
