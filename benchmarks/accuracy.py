@@ -260,8 +260,8 @@ def measure_draw(
 
 
 def outcome_of(session: Path) -> Outcome:
-    skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON)
-    skeleton = skeleton[skeleton["person"] == 0]
+    """Compare the first person of a reconstructed session with the truth."""
+    skeleton = read_table(session / "reconstruct" / "skeleton.parquet", SKELETON).query("person == 0")
     joints = tuple(skeleton["joint"].iloc[: skeleton["joint"].nunique()])
     shape = (skeleton["t_ns"].nunique(), len(joints))
     t_ns = skeleton["t_ns"].to_numpy(np.int64).reshape(shape)[:, 0]

@@ -81,6 +81,7 @@ FAR: Noise = {"white": {"rotation_deg": 0.2}, "bias": {"rotation_deg": 20.0}}
 """Errors of logged attitudes, stated: usual ones, and those of a mount that nobody knows."""
 USED = {"rtk": ("rtk", None), "gps": ("gps", None), "rtk, 20 deg off": ("rtk", FAR)}
 """Logs of `--used`, and errors of their attitudes, None where pictures show these."""
+NO_FILM = FilmOfCamera("", nullcontext)  # type: ignore[arg-type]  # the maps are kept: nobody opens it
 JOINED_FLIGHTS = "07-jog", "23-jog-and-crouch", "02-jog", "08-walk", "16-two-people"
 """Flights of three drones that move; the first two were tuned on."""
 
@@ -174,6 +175,7 @@ def used(names: Sequence[str], log: str, draws: int) -> list[str]:
     (place_log, far), found = USED[log], []
     noise, step_s = LOGS[place_log]
     models, usual, off = (noise_models("LOGS", each or TURNED) for each in (noise, TURNED, far))
+    turn = partial(turned_by_pictures, log, pose_noise=noise, note=lambda _: None, progress=Silent())
     for draw in range(draws):
         (flight,) = [each for each in flights() if each.name == names[draw % len(names)]]
         backgrounds, logged, other = read_backgrounds(flight), {}, {}
@@ -196,13 +198,10 @@ def used(names: Sequence[str], log: str, draws: int) -> list[str]:
                 logged[name] = Trajectory(t_ns, between, turned), _both(noise, TURNED)
                 other[name] = Trajectory(t_ns, between, away), _both(noise, far or TURNED)
                 if far is None:
-                    by = turned_by_pictures(
-                        flight.name, name, FilmOfCamera("", nullcontext),  # type: ignore[arg-type]
-                        CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), drone.intrinsics,
-                        Trajectory(t_ns[rows], places, np.full((len(rows), 4), np.nan)), refine_focal=False,
-                        pose_noise=noise, satellite_sigma_m=None, note=lambda _: None, progress=Silent(),
-                        kept=partial(_map_of, drone, backgrounds[name].tracks),
-                    )  # fmt: skip
+                    track = Trajectory(t_ns[rows], places, np.full((len(rows), 4), np.nan))
+                    film = NO_FILM, CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), drone.intrinsics
+                    kept = partial(_map_of, drone, backgrounds[name].tracks)
+                    by = turn(name, *film, track, refine_focal=False, satellite_sigma_m=None, kept=kept)
                     other[name] = by.trajectory, by.pose_noise
             sessions = [_session_of(drawn, Path(folder) / str(k), of) for k, of in enumerate((logged, other))]
             found.append([_outcome(flight, session) for session in sessions])
@@ -250,10 +249,10 @@ def joined(name: str) -> list[str]:
         drawn = DrawnFlight(flight, Path(folder) / "shared")
         cameras = {}
         for drone in drawn.simulated.drones:
-            t_ns, nothing = drone.at_frames.t_ns, FilmOfCamera("", nullcontext)  # type: ignore[arg-type]
-            frames, people = CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), kept.tables[drone.name]
-            own, map_of = drone.intrinsics, partial(_map_of, drone, backgrounds[drone.name].tracks)
-            cameras[drone.name] = UnposedCamera(nothing, frames, own, _detections(people), False, map_of)
+            t_ns, people = drone.at_frames.t_ns, _detections(kept.tables[drone.name])
+            film = NO_FILM, CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), drone.intrinsics
+            map_of = partial(_map_of, drone, backgrounds[drone.name].tracks)
+            cameras[drone.name] = UnposedCamera(*film, people, False, map_of)
         try:
             posed = posed_by_people(name, cameras, float(stature_m), lambda _: None, Silent())
         except DataError as error:

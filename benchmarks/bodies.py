@@ -193,8 +193,7 @@ def _at(truth: MovingBody, body: MovingBody) -> tuple[Float, Float]:
 
 def _about_hips(joints: Float) -> Float:
     """Subtract the middle of the hips from joints [T, J, 3] in the order of `CENTRES`."""
-    names = list(CENTRES)
-    hips = joints[:, [names.index("left_hip"), names.index("right_hip")]]
+    hips = joints[:, [list(CENTRES).index(f"{side}_hip") for side in ("left", "right")]]
     return np.asarray(joints - hips.mean(axis=1, keepdims=True))
 
 

@@ -90,7 +90,9 @@ def worlds(options: argparse.Namespace) -> Lines:
         worse = [(more["mean"] > least).sum() for least in (0.01, np.fmax(2 * more["sem"], 0.01))]
         where = f"{worse[0]} of {len(more)} worlds, by two standard errors in {worse[1]}"
         lines += ["", f"`joint` errs by over 1 % more than `adaptive` in {where}."]
-    return sys.exit("\n".join([*lines, *trouble])) if trouble else lines
+    if trouble:
+        sys.exit("\n".join([*lines, *trouble]))
+    return lines
 
 
 # --- published plans of groups ---------------------------------------------------------------------------

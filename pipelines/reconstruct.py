@@ -395,11 +395,8 @@ def _write_tables(
     folder: Path, attempt: Attempt, gait: pd.DataFrame, bodies: Sequence[BodyFit | None], waiting: Waiting
 ) -> None:
     observations, views, result = attempt.observations, attempt.views, attempt.result
-    skeletons, angles = (
-        skeleton_parts(observations, result),
-        angles_parts(observations, views, result, bodies),
-    )
-    join_tables(folder / "skeleton.parquet", waiting.between(skeletons), SKELETON)
+    angles = angles_parts(observations, views, result, bodies)
+    join_tables(folder / "skeleton.parquet", waiting.between(skeleton_parts(observations, result)), SKELETON)
     join_tables(folder / "angles.parquet", waiting.between(angles), ANGLES)
     write_table(folder / "gait.parquet", gait, GAIT)
     if any(body is not None for body in bodies):

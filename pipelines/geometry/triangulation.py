@@ -465,7 +465,7 @@ def triangulate_pictures(views: Views, *, picture: Int64, pixel_sigma: Float) ->
 
 
 def rows_of(views: Views, rows: slice | Int64) -> Views:
-    """Take some joint-frames."""
+    """Take the views of some joint-frames."""
     return replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
 
 
