@@ -14,19 +14,21 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
-from pipelines.formats.common.files import leads_out, numbers, read_head, read_yaml
+from pipelines.formats.common.files import leads_out, read_head, read_yaml
 from pipelines.formats.maps.voxel_grids import MapFile, extruded
 from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import bad_value, damaged, refuse_special
+from pipelines.session.yaml_files import checked
+from pipelines.session.yaml_models import YamlModel
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -36,22 +38,25 @@ HEIGHT_M = 2.5
 
 # A larger plan would exhaust the memory once it is raised to voxels.
 _MOST_PIXELS = 100_000_000
-_MODES = ("trinary", "scale", "raw")
 _SUFFIXES = (".pgm", ".png")
 # White in each of Pillow's modes without colours.
 _GREYS = {"1": 1, "L": 255, "I": 65535, "I;16": 65535, "I;16B": 65535}
 
 
-@dataclass(frozen=True)
-class _FloorPlan:
-    image: Path
-    mode: str
+_Threshold = Annotated[float, Field(ge=0, le=1)]
+_Place = Annotated[float, Field(gt=-1e9, lt=1e9)]
+
+
+class _FloorPlan(YamlModel):
+    model_config = ConfigDict(extra="ignore")
+
+    image: str
+    mode: Literal["trinary", "scale", "raw"] = "trinary"
     negate: bool
-    resolution_m: float
-    origin: tuple[float, float]
-    yaw: float
-    occupied_thresh: float
-    free_thresh: float
+    resolution: float
+    origin: tuple[_Place, _Place, _Place]  # x, y, yaw
+    occupied_thresh: _Threshold
+    free_thresh: _Threshold
 
 
 class RosMap(MapFile):
@@ -69,60 +74,31 @@ class RosMap(MapFile):
 
     def pictures(self, path: Path) -> list[Path]:
         """Return the files that the YAML refers to, because they too determine the map."""
-        return [_read_plan(path).image]
+        return [_find_image(path, _read_plan(path).image)]
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read, turn and extrude the plan; the grid's axes are the world's."""
         plan = _read_plan(path)
-        side_m = plan.resolution_m if resolution_m is None else check_resolution(path, resolution_m)
-        turned = np.array([0.0, 0.0, math.sin(plan.yaw / 2), math.cos(plan.yaw / 2)])
+        side_m = plan.resolution if resolution_m is None else check_resolution(path, resolution_m)
+        x, y, yaw = plan.origin
+        turned = np.array([0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)])
         return extruded(
             str(path),
             _probabilities(path, plan),
-            plan.resolution_m,
-            (np.array([*plan.origin, 0.0]), turned),
+            plan.resolution,
+            (np.array([x, y, 0.0]), turned),
             side_m=side_m,
             height_m=HEIGHT_M,
         )
 
 
 def _read_plan(path: Path) -> _FloorPlan:
-    values = read_yaml(path)
-    missing = [
-        key
-        for key in ("image", "resolution", "origin", "occupied_thresh", "free_thresh", "negate")
-        if key not in values
-    ]
-    if missing:
-        problem = f"lacks {', '.join(missing)}"
-        raise DataError(path, problem, "map_server's files have them all", code="missing-column")
-    origin = numbers(path, "origin", values["origin"])
-    resolution, occupied, free = numbers(
-        path,
-        "resolution, occupied_thresh, free_thresh",
-        [values[k] for k in ("resolution", "occupied_thresh", "free_thresh")],
-    ).tolist()
-    mode, image = values.get("mode", "trinary"), values["image"]
-    if len(origin) != 3 or not np.abs(origin).max() < 1e9:  # also true for NaN
-        raise bad_value(path, f"origin is {origin.tolist()} instead of x, y, yaw")
-    if not 0 <= free <= occupied <= 1:
-        raise bad_value(path, f"free_thresh {free:g} and occupied_thresh {occupied:g} are not 0..1")
-    if mode not in _MODES:
-        raise DataError(path, f"mode is {str(mode)[:40]!r}", f"known are {', '.join(_MODES)}")
-    if values["negate"] not in (0, 1):
-        raise DataError(path, f"negate is {str(values['negate'])[:40]!r}", "it must be 0 or 1")
-    if not isinstance(image, str):
-        raise DataError(path, f"image is {str(image)[:40]!r}", "it must name a PGM or PNG file")
-    return _FloorPlan(
-        image=_find_image(path, image),
-        mode=str(mode),
-        negate=bool(values["negate"]),
-        resolution_m=check_resolution(path, resolution),
-        origin=(float(origin[0]), float(origin[1])),
-        yaw=float(origin[2]),
-        occupied_thresh=occupied,
-        free_thresh=free,
-    )
+    plan = checked(_FloorPlan, read_yaml(path), path)
+    check_resolution(path, plan.resolution)
+    if plan.free_thresh > plan.occupied_thresh:
+        problem = f"free_thresh {plan.free_thresh:g} is above occupied_thresh {plan.occupied_thresh:g}"
+        raise bad_value(path, problem)
+    return plan
 
 
 def _find_image(path: Path, image: str) -> Path:
@@ -138,7 +114,7 @@ def _find_image(path: Path, image: str) -> Path:
 
 def _probabilities(path: Path, plan: _FloorPlan) -> Float32:
     """Read probabilities [W, H] from the lower left corner; NaN is unknown."""
-    shade, opaque = _picture(plan.image)
+    shade, opaque = _picture(_find_image(path, plan.image))
     if plan.mode == "raw":
         percent = np.rint(shade * 255)
         probability = np.where(percent <= 100, percent / 100, np.nan)
