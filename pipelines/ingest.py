@@ -7,10 +7,11 @@ of its own: an interrupted ingest continues with the cameras that it had not fin
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -225,7 +226,7 @@ def ingest(
     return Ingested(target, record, description, skipped=False)
 
 
-class _FlightReader:
+class _FlightReader(AbstractContextManager["_FlightReader"]):
     """Reader that stores the parts of one flight, collects doubts as notes, and closes its logs."""
 
     def __init__(
@@ -248,9 +249,6 @@ class _FlightReader:
         self.force = False  # maps of pictures of an earlier ingest are not used
         self.map_box: tuple[Float, Float] | None = None  # of the first map, once it is stored
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *exception: object) -> None:
         self._logs.__exit__(*exception)
 
@@ -271,19 +269,11 @@ class _FlightReader:
     def store_camera(self, name: str, folder: Path) -> None:
         """Write the tables of one camera, its entry and its warnings."""
         camera = self._flight.cameras[name]
-        logged = self._files.is_log("pose", camera.pose)
         (folder / "tables").mkdir()
         data = self._read_camera(name, folder / "tables")
         store_camera(data, folder / "tables")
         entry = camera_entry(
-            name,
-            camera,
-            data,
-            self._interpolation,
-            base=self._flight_path.parent,
-            stamps=self._logs.settings(camera.pose.file).stamps if logged else None,
-            axes=(self._pose_axes(camera), self._gimbal_axes(camera)),
-            note=self._take_note,
+            name, camera, data, self._interpolation, self._flight_path.parent, self._take_note
         )
         warnings = list(dict.fromkeys(data.notes + self.take_notes()))
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
@@ -330,6 +320,7 @@ class _FlightReader:
             detections, repeats = without_repeats(detections, frames)
             for repeat in repeats:
                 self._take_note(f"{name} {repeat}: they are left out")
+        logged = self._files.is_log("pose", camera.pose)
         return CameraData(
             detections,
             detector_format,
@@ -341,6 +332,8 @@ class _FlightReader:
             still=self.poses.is_still(camera),
             notes=self.take_notes(),
             pose_noise=pose_noise,
+            stamps=self._logs.settings(camera.pose.file).stamps if logged else None,
+            axes=(self._pose_axes(camera), self._gimbal_axes(camera)),
             picture_map=picture_map,
         )
 
@@ -436,16 +429,7 @@ class _FlightReader:
     def origin(self) -> OriginEntry | None:
         """Return the world's origin on Earth, if known; note cameras with different height references."""
         self.poses.doubt_heights()
-        found = self.poses.origin()
-        if found is None:
-            return None
-        place = found.place
-        return OriginEntry(
-            latitude_deg=place.latitude_deg,
-            longitude_deg=place.longitude_deg,
-            altitude_m=place.altitude_m,
-            source=found.source,
-        )
+        return self.poses.origin()
 
     def store_truth(self, folder: Path, entries: Mapping[str, CameraEntry]) -> TruthEntry | None:
         """Write the ground truth, and return its entry with its joints, cameras and time span."""

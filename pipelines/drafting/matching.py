@@ -666,26 +666,25 @@ def _may_be_of(film: FoundFilm, log: Proposal) -> bool:
     return 2 * overlap_ns >= film.length_ns
 
 
+@dataclass(frozen=True)
 class _Chooser:
     """Chooser of candidates of one kind for one camera; `anchors` define the time of the flight."""
 
-    def __init__(
-        self, camera: CameraDraft, cameras: Sequence[CameraDraft], anchors: Sequence[Proposal]
-    ) -> None:
-        self._camera = camera
-        self._lone = len(cameras) == 1
-        self._anchors = anchors
+    camera: CameraDraft
+    cameras: Sequence[CameraDraft]
+    anchors: Sequence[Proposal]
 
     def __call__(self, candidates: Sequence[Proposal], *, shared: bool = False) -> Chosen | None:
         """Choose the best candidate with the camera's name; or the only one, for the only camera."""
-        likeness = {id(c): _likeness(c, self._camera.label) for c in candidates}
-        least = UNNAMED if self._lone or shared else NUMBER
+        lone = len(self.cameras) == 1
+        likeness = {id(c): _likeness(c, self.camera.label) for c in candidates}
+        least = UNNAMED if lone or shared else NUMBER
         rivals = [c for c in candidates if likeness[id(c)] >= least]
         # The only candidate is taken, and for a lone camera the likeliest topic of the only log.
-        one_log = self._lone and len({c.path for c in candidates if c.topic or "parent" in c.settings}) == 1
+        one_log = lone and len({c.path for c in candidates if c.topic or "parent" in c.settings}) == 1
         one_log &= all(c.topic or "parent" in c.settings for c in candidates)
-        if not rivals and (one_log or (len(candidates) == 1 and (self._lone or shared))):
-            own = self._camera.label
+        if not rivals and (one_log or (len(candidates) == 1 and (lone or shared))):
+            own = self.camera.label
             rivals = [c for c in candidates if not any(_are_two(own, label) for label in c.labels)]
         if not rivals:
             return None
@@ -702,11 +701,11 @@ class _Chooser:
 
         taken, *others = sorted(rivals, key=key)
         best = likeness[id(taken)]
-        return Chosen(taken, tuple(others), named=best >= NUMBER or (self._lone and best != OTHER))
+        return Chosen(taken, tuple(others), named=best >= NUMBER or (lone and best != OTHER))
 
     def _near(self, candidate: Proposal) -> int:
         """Count the leading name parts that a camera info shares with the topic of the pictures."""
-        logged = self._camera.logged_film
+        logged = self.camera.logged_film
         if candidate.kind != "intrinsics" or not candidate.topic or logged is None:
             return 0
         names = [[*each.topic.strip("/").split("/"), ""] for each in (candidate, logged)]
@@ -714,8 +713,8 @@ class _Chooser:
 
     def _times(self, rivals: Sequence[Proposal]) -> dict[int, float]:
         """Compute how long each overlaps in time with the camera's film, or else with the other logs."""
-        filmed = self._camera.logged_film
-        others = [anchor for anchor in self._anchors if all(anchor is not rival for rival in rivals)]
+        filmed = self.camera.logged_film
+        others = [anchor for anchor in self.anchors if all(anchor is not rival for rival in rivals)]
         anchors = [filmed.span] if filmed and filmed.span else _spans(others)
         return {id(rival): _shared([rival.span], anchors) for rival in rivals}
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,25 @@ def camera_matrix(intrinsics: Intrinsics) -> Float:
     return np.array(
         [[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]]
     )
+
+
+def camera_info(intrinsics: Intrinsics) -> dict[str, Any]:
+    """Return a camera's fields of ROS's message CameraInfo, with as many coefficients as its model takes."""
+    matrix, distortion = camera_matrix(intrinsics), [float(v) for v in intrinsics.distortion]
+    model = "rational_polynomial" if len(distortion) > 5 else "plumb_bob"
+    if intrinsics.model == "fisheye":
+        model = "equidistant"
+    else:
+        distortion += [0.0] * (5 - len(distortion))
+    return {
+        "width": intrinsics.width,
+        "height": intrinsics.height,
+        "distortion_model": model,
+        "d": distortion,
+        "k": matrix.ravel().tolist(),
+        "r": np.eye(3).ravel().tolist(),
+        "p": np.pad(matrix, [(0, 0), (0, 1)]).ravel().tolist(),
+    }
 
 
 def project(points_camera: Float, intrinsics: Intrinsics) -> Float:

@@ -7,12 +7,13 @@ extension needs an optional library that is missing, the error gives the command
 import re
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points, requires
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,7 +138,7 @@ class JointFormat(Format, Protocol):
         """Read the joints as metres, z up; `unit` (m, cm, mm), `axes` (z-up, y-up) if the user gives them."""
 
 
-class Log(Protocol):
+class Log(AbstractContextManager["Log"], Protocol):
     """An open recording of one or more files; a context manager that closes them."""
 
     @property
@@ -150,9 +151,6 @@ class Log(Protocol):
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some channels in the order of receipt; others are not decoded."""
-
-    def __enter__(self) -> Self:
-        """Return the log itself."""
 
     def __exit__(self, *exception: object) -> None:
         """Close the files."""

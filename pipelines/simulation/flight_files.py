@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.body_model import SHAPE, body_model, shape_of
+from pipelines.geometry.cameras import camera_info
 from pipelines.geometry.poses import conjugate, pose_covariance_in_body
 from pipelines.geometry.rig import BONES, joint_centres
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS
@@ -304,16 +305,7 @@ def _gimbal(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMe
 
 
 def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
-    lens = drone.intrinsics
-    fields = {
-        "width": lens.width,
-        "height": lens.height,
-        "distortion_model": "rational_polynomial" if len(lens.distortion) > 5 else "plumb_bob",
-        "d": [*lens.distortion, *[0.0] * (5 - len(lens.distortion))],
-        "k": [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0],
-        "r": np.eye(3),
-        "p": [lens.fx, 0.0, lens.cx, 0.0, 0.0, lens.fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-    }
+    fields = camera_info(drone.intrinsics)
     first, last = drone.log.body.t_ns[[0, -1]] + flight.scenario.start_ns
     for stamp_ns in range(int(first), int(last), _CAMERA_INFO_NS):
         stamped = {"header": {"stamp": stamp_ns, "frame_id": f"{drone.name}/camera"}, **fields}

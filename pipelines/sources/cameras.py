@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from pipelines.session.records import SHARED_SECONDS, UNTIMED, Detections, Video
 from pipelines.session.storage import is_folder
 from pipelines.session.urls import media_path
 from pipelines.sources.files import FlightFiles
-from pipelines.sources.logs import FlightLogs, Frames
+from pipelines.sources.logs import FlightLogs
 from pipelines.sources.parts import CameraFrames
 
 # So many frames last 18 hours at 30 Hz: a larger number was misread from a date.
@@ -40,23 +40,15 @@ TriggerTimes = Callable[[CameraSources], Int64 | None]
 """Reader of the trigger times of a camera's pictures in a drone's own log, at world times; None without."""
 
 
+@dataclass(frozen=True)
 class FlightCameras:
     """Reader of frame times and intrinsics; `triggers` reads the times of a drone's own log."""
 
-    def __init__(
-        self,
-        manifest: Path,
-        logs: FlightLogs,
-        files: FlightFiles,
-        triggers: TriggerTimes,
-        note: Callable[[str], None],
-    ) -> None:
-        self._manifest = manifest
-        self._base = manifest.parent
-        self._logs = logs
-        self._files = files
-        self._triggers = triggers
-        self._note = note
+    manifest: Path
+    logs: FlightLogs
+    files: FlightFiles
+    triggers: TriggerTimes
+    note: Callable[[str], None]
 
     def frames(
         self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
@@ -70,63 +62,64 @@ class FlightCameras:
         self, name: str, camera: CameraSources, video: VideoIndex | None, detections: Detections | None
     ) -> CameraFrames:
         times = camera.frame_times or FrameTimes()
-        logged = None
-        if camera.video is not None and self._files.is_log("video", camera.video):
-            logged = self._logs.frames(camera.video.file, camera.video.topic)
-        pictures = _pictures(video, logged)
+        pictures = None
+        if video is not None:
+            pictures = CameraFrames(np.arange(video.count), video.pts_ns, video.pts_ns, dropped=video.dropped)
+        elif camera.video is not None:
+            pictures = self.logs.frames(camera.video.file, camera.video.topic)
         for line in video.notes if video is not None else ():
-            self._note(f"{name}: {line}")
+            self.note(f"{name}: {line}")
         if times.fps is not None:
             taken = np.arange(len(pictures.t_ns) if pictures else self._listed_frames(camera, detections))
             if video is not None:
                 taken = _numbers_as_taken(video.pts_ns)
             if lost_count := int(taken[-1]) + 1 - len(taken):
-                self._note(f"{name}: {lost_count} pictures are missing by its stamps; fps counts them, too")
+                self.note(f"{name}: {lost_count} pictures are missing by its stamps; fps counts them, too")
             # Python's integers never overflow.
             since_start = np.array([round(k * 10**9 / times.fps) for k in taken.tolist()], dtype=np.int64)
             topic, lost = (pictures.topic, pictures.dropped) if pictures else (None, {})
             start_ns = self._start_ns(name, camera, times)
             return CameraFrames(np.arange(len(taken)), start_ns + since_start, since_start, topic, lost)
-        if times.file and self._files.is_log("frame_times", times):
-            stamped = self._logs.frames(times.file, times.topic)
+        if times.file and self.files.is_log("frame_times", times):
+            stamped = self.logs.frames(times.file, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
         if times.file:
-            triggered = self._triggers(camera)
+            triggered = self.triggers(camera)
             if triggered is not None:
                 return self._frames_by_stamps(triggered, {}, pictures)
-            return self._frames_of_file(self._files.path(times.file), pictures)
+            return self._frames_of_file(self.files.path(times.file), pictures)
         if pictures is None:
             problem = f"cameras.{name}: nothing says when its frames were taken"
             remedy = "write frame_times: {start: SECONDS, fps: 30}"
-            raise DataError(self._manifest, problem, remedy, code="clock-unknown")
+            raise DataError(self.manifest, problem, remedy, code="clock-unknown")
         if video is not None and video.codec == UNTIMED:
             problem = (
                 f"cameras.{name}: its pictures have no times of their own that rise from one to the next"
             )
             remedy = "write frame_times: {start: SECONDS, fps: 30}, or give a csv"
-            raise DataError(self._manifest, problem, remedy, code="clock-unknown")
+            raise DataError(self.manifest, problem, remedy, code="clock-unknown")
         if video is not None and video.codec == SHARED_SECONDS and camera.clock is None:
-            self._note(
+            self.note(
                 f"{name}: several of its pictures share a second in EXIF and are spread evenly over it: say"
                 " clock: {sigma_s: 1}"
             )
-        if logged is None:
+        if video is not None:
             return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
         if times.has_start:
             problem = f"cameras.{name}.frame_times: start has no use, the log stamps its pictures"
             remedy = "leave it out, or correct the log's clock with logs: {...: {clock: ...}}"
-            raise DataError(self._manifest, problem, remedy, code="stated-twice")
+            raise DataError(self.manifest, problem, remedy, code="stated-twice")
         return pictures
 
     def _listed_frames(self, camera: CameraSources, detections: Detections | None) -> int:
         if detections is None or camera.keypoints is None:
             problem = "a camera without video and keypoints has no frames"
-            raise DataError(self._manifest, problem, "give it one of them", code="no-pictures")
+            raise DataError(self.manifest, problem, "give it one of them", code="no-pictures")
         count = int(detections.frames_listed[-1]) + 1
         if count > MAX_FRAMES:
             problem = f"numbers its frames up to {count - 1}"
             remedy = "say with first_frame which number the first frame bears"
-            raise DataError(self._files.path(camera.keypoints.file), problem, remedy, code="bad-value")
+            raise DataError(self.files.path(camera.keypoints.file), problem, remedy, code="bad-value")
         return count
 
     def _frames_of_file(self, path: Path, pictures: CameraFrames | None) -> CameraFrames:
@@ -148,14 +141,14 @@ class FlightCameras:
         """Return the start of a video that has stamps of its own."""
         if isinstance(times.start_ns, int):
             return times.start_ns
-        path = self._files.video_file(camera)
+        path = self.files.video_file(camera)
         made_ns = _made_ns(path) if path is not None else None
         if made_ns is None:
             problem = "does not say when it was made"
             remedy = f"write frame_times: {{start: SECONDS}} for camera {name}"
-            raise DataError(path or self._manifest, problem, remedy, code="clock-unknown")
+            raise DataError(path or self.manifest, problem, remedy, code="clock-unknown")
         if camera.clock is None and path is not None and not is_folder(path):
-            self._note(
+            self.note(
                 f"{name}: its video says that it was made at {made_ns / 1e9:.0f} s, to a second at best:"
                 " say clock: {sigma_s: 1}"
             )
@@ -179,13 +172,13 @@ class FlightCameras:
         video = camera.video
         if video is None:
             return None
-        is_log = self._files.is_log("video", video)
-        stated = self._logs.settings(video.file).file
+        is_log = self.files.is_log("video", video)
+        stated = self.logs.settings(video.file).file
         return MediaEntry(
-            paths=[media_path(self._base, path, session) for path in stated],
+            paths=[media_path(self.manifest.parent, path, session) for path in stated],
             sources=stated,
             topic=frames.topic,
-            stamps=self._logs.settings(video.file).stamps if is_log else "header",
+            stamps=self.logs.settings(video.file).stamps if is_log else "header",
         )
 
     def intrinsics(
@@ -193,26 +186,26 @@ class FlightCameras:
     ) -> Intrinsics:
         """Return a camera's intrinsics, fitted to its pictures; DataError: missing, or another shape."""
         source = camera.intrinsics
-        place = f"{self._manifest}: cameras.{name}.intrinsics"
-        if source.file and not self._files.is_log("intrinsics", source):
-            path = self._files.path(source.file)
-            calibrated = self._files.camera(name, "intrinsics", source)
+        place = f"{self.manifest}: cameras.{name}.intrinsics"
+        if source.file and not self.files.is_log("intrinsics", source):
+            path = self.files.path(source.file)
+            calibrated = self.files.camera(name, "intrinsics", source)
             if calibrated.intrinsics is None:
                 problem = "holds poses but no intrinsics"
                 raise DataError(path, problem, "name one with both", code="no-intrinsics")
             intrinsics = calibrated.intrinsics
             if calibrated.note:
-                self._note(f"{name}: {calibrated.note}")
+                self.note(f"{name}: {calibrated.note}")
             if not calibrated.size_stated:
                 size = self._picture_size(camera, video, detections)
                 intrinsics = _with_size(intrinsics, size, path)
-                self._note(f"{name}: its calibration states no picture size; that of its pictures is taken")
+                self.note(f"{name}: its calibration states no picture size; that of its pictures is taken")
         elif source.file:
-            intrinsics = self._logs.intrinsics(source.file, source.topic)
+            intrinsics = self.logs.intrinsics(source.file, source.topic)
         else:
             intrinsics = _inline_intrinsics(source, place)
         if intrinsics.off_centre > FAR_OFF_CENTRE:
-            self._note(
+            self.note(
                 f"{name}: its principal point {intrinsics.cx:.0f}, {intrinsics.cy:.0f} px is far from the"
                 f" middle of {intrinsics.width} x {intrinsics.height} px, as of a part of a sensor, or of the"
                 " calibration of another size"
@@ -221,7 +214,7 @@ class FlightCameras:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
         if size := self._picture_size(camera, video, detections):
             bars = (0, 0, 0, 0)
-            file = self._files.video_file(camera)
+            file = self.files.video_file(camera)
             if file is not None and not is_folder(file) and not is_resized(intrinsics, *size):
                 bars = black_bars(file)
             try:
@@ -230,7 +223,7 @@ class FlightCameras:
                 remedy = "give the calibration that belongs to these pictures"
                 raise DataError(place, str(error), remedy, code="wrong-size") from None
             if note:
-                self._note(f"{name}: {note}")
+                self.note(f"{name}: {note}")
         if detections is not None:
             _refuse_keypoints_outside(place, intrinsics, detections)
         return intrinsics
@@ -242,8 +235,8 @@ class FlightCameras:
         if video is not None:
             return video.width, video.height
         logged = camera.video
-        if logged and self._files.is_log("video", logged):
-            size = self._logs.picture_size(logged.file, logged.topic)
+        if logged and self.files.is_log("video", logged):
+            size = self.logs.picture_size(logged.file, logged.topic)
             if size:
                 return size
         return detections.image_size if detections else None
@@ -257,16 +250,6 @@ def _numbers_as_taken(pts_ns: Int64) -> Int64:
     if (counts < 1).any() or (np.abs(steps_ns - counts * usual_ns) > _EVEN * usual_ns).any():
         return np.arange(len(pts_ns))
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-
-
-def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames | None:
-    if video is not None:
-        return CameraFrames(np.arange(video.count), video.pts_ns, video.pts_ns, dropped=video.dropped)
-    if logged is not None:
-        since_start = logged.t_ns - logged.t_ns[0]
-        count = np.arange(len(since_start))
-        return CameraFrames(count, logged.t_ns, since_start, logged.topic, logged.dropped)
-    return None
 
 
 def _made_ns(path: Path) -> int | None:

@@ -5,10 +5,10 @@ If no topic is stated, the only candidate of its kind is taken, and a note names
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from pipelines.session.recognition import recognise
 from pipelines.session.records import IntrinsicsSample, Message, PictureSample, PoseSample, Trajectory
 from pipelines.session.registries import Log, LogFormat
 from pipelines.session.urls import located
+from pipelines.sources.parts import CameraFrames
 from pipelines.sources.world import in_enu, in_world, world_times
 
 # The tables of so many messages, of all logs that stay open, take 160 MB.
@@ -62,15 +63,6 @@ _NOUNS: dict[Kind, str] = {
     "intrinsics": "camera info",
     "pictures": "pictures",
 }
-
-
-@dataclass(frozen=True)
-class Frames:
-    """Pictures of a topic, with the time at which each was taken, strictly increasing."""
-
-    topic: str
-    t_ns: Int64
-    dropped: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -152,7 +144,7 @@ class FlightLog:
         )
 
 
-class FlightLogs:
+class FlightLogs(AbstractContextManager["FlightLogs"]):
     """Logs of one flight; a context manager that closes those that it keeps open, within bounds."""
 
     def __init__(self, flight: Manifest, base: Path, note: Callable[[str], None]) -> None:
@@ -160,9 +152,6 @@ class FlightLogs:
         self._base = base
         self._note = note
         self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the most recently used one is last
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         for paths in list(self._kept):
@@ -283,7 +272,7 @@ class FlightLogs:
             raise DataError(source, problem, remedy, code="no-intrinsics" if count else "empty")
         return next(iter(found))
 
-    def frames(self, log: str, topic: str | None) -> Frames:
+    def frames(self, log: str, topic: str | None) -> CameraFrames:
         """Read the times at which a topic's pictures were taken, at world times; DataError: none."""
         with self.open(log) as opened:
             name = opened.choose("pictures", topic)
@@ -299,7 +288,8 @@ class FlightLogs:
                 place = first[np.searchsorted(stamps_ns, t_ns).clip(max=len(first) - 1)]
                 mended = without_steps(taken_ns, steps)[place]
                 t_ns = np.maximum.accumulate(np.where(taken_ns[place] == t_ns, mended, t_ns))
-            return Frames(name, opened.world_times(t_ns), dict(lost))
+            t_ns = opened.world_times(t_ns)
+            return CameraFrames(np.arange(len(t_ns)), t_ns, t_ns - t_ns[0], name, dict(lost))
 
     def picture_size(self, log: str, topic: str | None) -> tuple[int, int] | None:
         """Return width and height of a topic's pictures, from the first readable one; None without any."""

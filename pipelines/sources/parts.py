@@ -76,6 +76,8 @@ class CameraData:
     still: bool  # it stands still, with one pose
     notes: list[str]
     pose_noise: dict[str, dict[str, float | str]] | None
+    stamps: str | None  # of a log of poses
+    axes: tuple[Axes, Axes]  # of poses, and of a gimbal's angles
     picture_map: PictureMapEntry | None = None
 
 
@@ -94,10 +96,7 @@ def camera_entry(
     camera: CameraSources,
     data: CameraData,
     interpolation: Interpolation,
-    *,
     base: Path,
-    stamps: str | None,
-    axes: tuple[Axes, Axes],
     note: Callable[[str], None],
 ) -> CameraEntry:
     """Describe a camera for session.json, and note doubts and losses; DataError: no frame has a pose."""
@@ -111,7 +110,7 @@ def camera_entry(
             rate_hz=_rate(frames.t_ns),
             dropped=frames.dropped,
         ),
-        poses=_poses_entry(name, camera, data, interpolation, base=base, stamps=stamps, axes=axes, note=note),
+        poses=_poses_entry(name, camera, data, interpolation, base, note),
         keypoints=_keypoints_entry(camera, data),
         clock=ClockEntry(
             offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
@@ -140,10 +139,7 @@ def _poses_entry(
     camera: CameraSources,
     data: CameraData,
     interpolation: Interpolation,
-    *,
     base: Path,
-    stamps: str | None,
-    axes: tuple[Axes, Axes],
     note: Callable[[str], None],
 ) -> PosesEntry:
     pose, trajectory, frames_t_ns = camera.pose, data.trajectory, data.frames.t_ns
@@ -187,14 +183,14 @@ def _poses_entry(
         gaps_ns=[] if static else gaps(trajectory.t_ns, interpolation.max_gap_ns),
         frames_without_pose=without_pose,
         dropped=trajectory.dropped,
-        stamps=stamps,
+        stamps=data.stamps,
         topic=pose.topic,
         gimbal=_gimbal_of(camera),
         gimbal_fixed=camera.gimbal is not None and camera.gimbal.is_fixed,
-        gimbal_axes=axes[1],
+        gimbal_axes=data.axes[1],
         gimbal_log=(camera.gimbal.file or None) if camera.gimbal is not None else None,
         gimbal_topic=camera.gimbal.topic if camera.gimbal is not None else None,
-        axes=axes[0],
+        axes=data.axes[0],
         mount=None if camera.gimbal else _mount_entry(camera),
         in_gimbal=_mount_entry(camera) if camera.gimbal else None,
         inverse=bool(pose.options.get("inverse")),

@@ -1,10 +1,10 @@
 """Pictures of a camera by frame number, from a video file or from a topic of a log."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Protocol
 
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.pictures import KNOWN, decode, is_known, later_pictures
@@ -21,14 +21,11 @@ from pipelines.session.storage import file_stamp, is_folder, sha256_of
 from pipelines.session.urls import located
 
 
-class CameraPictures(Protocol):
+class CameraPictures(AbstractContextManager["CameraPictures"], Protocol):
     """Reader of pictures; a context manager."""
 
     def read(self, number: int) -> Picture | None:
         """Read one picture, BGR; None if it cannot be decoded."""
-
-    def __enter__(self) -> Self:
-        """Return the reader itself."""
 
     def __exit__(self, *exception: object) -> None:
         """Close the files."""
@@ -81,7 +78,7 @@ def _media(description: Description, camera: str) -> MediaEntry:
     return media
 
 
-class LoggedPictures:
+class LoggedPictures(AbstractContextManager["LoggedPictures"]):
     """Pictures of a topic, numbered as in ingest; reading backward restarts. DataError: cannot be read."""
 
     def __init__(self, paths: list[Path], topic: str, stamps: str) -> None:
@@ -97,9 +94,6 @@ class LoggedPictures:
             unless_known.callback(self._stack.close)
             self._refuse_unknown()
             unless_known.pop_all()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self._stack.close()

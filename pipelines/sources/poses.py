@@ -6,7 +6,7 @@ They are joined here, in ENU axes about one origin on Earth.
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,7 +28,7 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
     rotate,
 )
-from pipelines.session.description import Doubt
+from pipelines.session.description import Doubt, OriginEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import (
     ActorSource,
@@ -98,14 +98,6 @@ _ADD_MOUNT = (
 Track = TypeVar("Track", PositionTrack, AttitudeTrack)
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Origin of the world on Earth."""
-
-    place: Place
-    source: str  # "world.origin", or the log whose first position it is
-
-
 class FlightPoses:
     """Reader of the poses of one flight in the world's axes, at its times; `note` receives each choice."""
 
@@ -126,7 +118,7 @@ class FlightPoses:
         self._files = files
         self._max_gap_ns = max_gap_ns
         self._note = note
-        self._origin: Origin | None = None
+        self._origin: OriginEntry | None = None
         self._telemetry: dict[str, Telemetry] = {}
         self._upright = upright(flight.world)
         crs = flight.world.crs
@@ -560,7 +552,7 @@ class FlightPoses:
 
     # --- the origin ------------------------------------------------------------------------------------
 
-    def origin(self) -> Origin | None:
+    def origin(self) -> OriginEntry | None:
         """Return the world's origin: the stated one, else the first position on Earth of the first camera.
 
         Its height is 0 if that camera's heights count from the take-off or are stated. None without either.
@@ -568,8 +560,7 @@ class FlightPoses:
         if self._origin is not None:
             return self._origin
         if stated := self._flight.world.origin:
-            place = Place(stated.latitude_deg, stated.longitude_deg, stated.altitude_m)
-            self._origin = Origin(place, "world.origin")
+            self._origin = OriginEntry(**stated.model_dump(), source="world.origin")
             return self._origin
         for camera in self._flight.cameras.values():
             if not self._is_joined(camera.pose):
@@ -577,12 +568,13 @@ class FlightPoses:
             track = self._read(camera.pose).position
             first = track.origin or (_first_place(track) if track.on_earth else None)
             if first is not None:
-                self._origin = Origin(first, camera.pose.file)
+                self._origin = OriginEntry(**asdict(first), source=camera.pose.file)
                 return self._origin
         if self._projection is not None:  # the first position of the first camera
             name, camera = next(iter(self._flight.cameras.items()))
             source, poses = self._stated_poses(name, camera)
-            self._origin = Origin(self._projection.first_place(source, poses.position), str(source.name))
+            first = self._projection.first_place(source, poses.position)
+            self._origin = OriginEntry(**asdict(first), source=source.name)
         return self._origin
 
     def doubt_heights(self) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.geometry.arrays import DistortionModel, Float, Intrinsics
+from pipelines.geometry.cameras import camera_info
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 from pipelines.session.storage import damaged
@@ -112,31 +113,18 @@ def _camera_line(camera: CalibratedCamera) -> str:
 
 def write_camera_info(path: Path, name: str, intrinsics: Intrinsics) -> None:
     """Write one camera; numbers keep their full precision."""
-    model, distortion = ros_distortion(intrinsics)
-    fx, fy, cx, cy = (float(v) for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
-    matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    info = camera_info(intrinsics)
     lines = [
         f"image_width: {intrinsics.width}",
         f"image_height: {intrinsics.height}",
         f"camera_name: {name}",
-        *_written_matrix("camera_matrix", 3, 3, matrix),
-        f"distortion_model: {model}",
-        *_written_matrix("distortion_coefficients", 1, len(distortion), distortion),
-        *_written_matrix("rectification_matrix", 3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
-        *_written_matrix("projection_matrix", 3, 4, projection),
+        *_written_matrix("camera_matrix", 3, 3, info["k"]),
+        f"distortion_model: {info['distortion_model']}",
+        *_written_matrix("distortion_coefficients", 1, len(info["d"]), info["d"]),
+        *_written_matrix("rectification_matrix", 3, 3, info["r"]),
+        *_written_matrix("projection_matrix", 3, 4, info["p"]),
     ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-
-
-def ros_distortion(intrinsics: Intrinsics) -> tuple[str, list[float]]:
-    """Return the model's name in ROS, and as many coefficients as that model takes there."""
-    coefficients = [float(v) for v in intrinsics.distortion]
-    if intrinsics.model == "fisheye":
-        return "equidistant", coefficients
-    if len(coefficients) > 5:
-        return "rational_polynomial", coefficients
-    return "plumb_bob", [*coefficients, *[0.0] * (5 - len(coefficients))]
 
 
 def _written_matrix(key: str, rows: int, columns: int, data: list[float]) -> list[str]:

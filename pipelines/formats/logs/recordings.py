@@ -12,6 +12,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
@@ -347,7 +348,7 @@ def inflated_limit(file_size: int) -> int:
 # --- logs of one file or several --------------------------------------------------------------------------
 
 
-class OpenLog:
+class OpenLog(AbstractContextManager["OpenLog"]):
     """Open log of one or more parts."""
 
     def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
@@ -360,9 +361,6 @@ class OpenLog:
             for number, channel in part.channels.items():
                 self._channels.setdefault(channel.key, {}).setdefault(place, []).append(number)
         self._topics = self._summaries()
-
-    def __enter__(self) -> OpenLog:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         for part in self.parts:

@@ -19,9 +19,10 @@ any. The same recording gives the same bytes; frames are never all in memory.
 import heapq
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -29,7 +30,6 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from pipelines.formats.calibrations.camera_matrices import ros_distortion
 from pipelines.formats.common.exporting import (
     ellipsoids_95,
     note_no_skeleton,
@@ -39,7 +39,7 @@ from pipelines.formats.common.exporting import (
 )
 from pipelines.formats.videos.video_writing import H264Stream
 from pipelines.geometry.arrays import Float, Intrinsics
-from pipelines.geometry.cameras import rescaled
+from pipelines.geometry.cameras import camera_info, rescaled
 from pipelines.session.errors import DataError
 from pipelines.session.people import bones_of, side_of, with_derived
 from pipelines.session.records import JointMotion, Recording, Trajectory
@@ -57,7 +57,7 @@ string format
 _BYTES = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}
 
 
-class Ros2Recording:
+class Ros2Recording(AbstractContextManager["Ros2Recording"]):
     """Log that is being written; a context manager. The same messages give the same bytes."""
 
     def __init__(self, path: Path) -> None:
@@ -69,9 +69,6 @@ class Ros2Recording:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -358,21 +355,8 @@ def _pictures(
 
 
 def _info(t_ns: int, name: str, topic: str, lens: Intrinsics) -> Entry:
-    fields = {"header": {"stamp": t_ns, "frame_id": name}, **_camera_info(lens)}
+    fields = {"header": {"stamp": t_ns, "frame_id": name}, **camera_info(lens)}
     return t_ns, f"{topic}/camera_info", "sensor_msgs/msg/CameraInfo", fields
-
-
-def _camera_info(lens: Intrinsics) -> dict[str, Any]:
-    model, distortion = ros_distortion(lens)
-    return {
-        "width": lens.width,
-        "height": lens.height,
-        "distortion_model": model,
-        "d": distortion,
-        "k": [lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1],
-        "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
-        "p": [lens.fx, 0, lens.cx, 0, 0, lens.fy, lens.cy, 0, 0, 0, 1, 0],
-    }
 
 
 # --- the map -------------------------------------------------------------------------------------------

@@ -10,14 +10,14 @@ from __future__ import annotations
 import bisect
 import re
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fractions import Fraction
 from functools import lru_cache
 from itertools import chain, takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -171,7 +171,7 @@ def black_bars(path: Path) -> tuple[int, int, int, int]:
     return left, top, right, bottom
 
 
-class VideoReader:
+class VideoReader(AbstractContextManager["VideoReader"]):
     """Open video with its `index`: BGR pictures by number in any order; `missing` are undecodable ones."""
 
     index: VideoIndex
@@ -196,9 +196,6 @@ class VideoReader:
             remedy = "export it again, so that its pictures are as the lens saw them"
             raise DataError(path, problem, remedy, code="unsupported")
         self.index = _index(self._scan, self._stream, self._next[1])
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
