@@ -19,7 +19,6 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from fractions import Fraction
-from itertools import pairwise
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -29,7 +28,7 @@ from pydantic import BaseModel
 from pipelines import api
 from pipelines.planning.config import Imperfections, PlannerConfig
 from pipelines.session import camera_poses, registries, tables
-from pipelines.session.description import DOUBT_CODES
+from pipelines.session.errors import read_codes
 from pipelines.session.manifest import FileSource, Manifest, option_models
 
 DOCS = Path(__file__).parent
@@ -261,13 +260,10 @@ def exports() -> str:
 
 def columns() -> str:
     """List the tables of a session with their columns."""
-    body = ast.parse(inspect.getsource(tables)).body
     rows = []
-    for node, following in pairwise(body):
-        file, colon, meaning = _text_of(following).partition(": ")
-        if isinstance(node, ast.Assign) and colon and file.endswith(".parquet"):
-            names = getattr(tables, ast.unparse(node.targets[0])).names
-            rows.append((f"`{file}`", ", ".join(f"`{name}`" for name in names), sentence(meaning)))
+    for name, stored in tables.TABLES.items():
+        columns = ", ".join(f"`{column}`" for column in getattr(tables, name).names)
+        rows.append((f"`{stored['file']}`", columns, sentence(" ".join(stored["holds"].split()))))
     return table(("file", "columns", "holds"), rows)
 
 
@@ -275,7 +271,7 @@ def codes() -> str:
     """List the codes of doubts."""
     rows = [
         (f"`{code}`", meaning, ", ".join(f"`{key}`" for key in keys.split(", ") if key))
-        for code, (meaning, keys) in DOUBT_CODES.items()
+        for code, (meaning, keys) in read_codes("doubts").items()
     ]
     return table(("code", "means", "change"), rows)
 

@@ -6,18 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.session.errors import CODES, DataError
+from pipelines.session.errors import DataError, read_codes
 
 
 @contextmanager
 def refused(
     code: str, source: Path | str | None = None, *names: object
 ) -> Iterator[pytest.ExceptionInfo[DataError]]:
-    """Expect a DataError of a code of `CODES` about a file, folder or setting (any, if None).
+    """Expect a DataError of a known code about a file, folder or setting (any, if None).
 
     `names` are numbers, keys, files and codes that its line must hold, each as text.
     """
-    assert code in CODES, f"{code} is not in pipelines/session/errors.py"
+    assert code in read_codes("errors"), f"{code} is no known code"
     with pytest.raises(DataError) as caught:
         yield caught
     error = caught.value

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from pipelines.session.records import Height, Telemetry
+from pipelines.session.storage import own_table
 
 # --- labels ----------------------------------------------------------------------------------------------
 
@@ -26,19 +27,12 @@ EQUAL, PART, NUMBER, UNNAMED, OTHER = 4, 3, 2, 1, 0
 """Ratings of two labels: they are the same; one is within the other; only the numbers agree (d1, drone1); one
 of them is empty; they differ."""
 
-TRUTH_WORDS = frozenset({"truth", "true", "gt", "groundtruth"})
-_GENERIC_TEXT = """
-    cam camera cameras video videos vid movie clip image images img picture pictures frame frames photo
-    rgb bgr color colour mono gray raw compressed rect rectified info odometry odom pose poses trajectory
-    traj path paths tf transform transforms tum csv json toml yaml yml txt log logs bag bags rosbag mcap
-    data dataset recording record keypoints keypoint kpts kp joints skeleton openpose alphapose mmpose coco
-    detections detection detector results result predictions calib calibration calibrations intrinsic
-    intrinsics extrinsic extrinsics camchain kalibr opencv ost ground gimbal attitude angles angle local
-    position orientation mavros state estimator estimate filtered fused global world map time times
-    timestamp timestamps stamps stamp static base link body optical imu vio slam the of and
-"""
-_GENERIC = TRUTH_WORDS | frozenset(_GENERIC_TEXT.split())
-"""Words for the kind of a thing, which do not name its owner. With a number (cam01) they do name a camera."""
+_WORDS = {kind: frozenset(words.split()) for kind, words in own_table(__file__, "words").items()}
+TRUTH_WORDS, COMMANDED, ACTOR, NO_PICTURES, OPTICAL, BODIES, GIMBAL, NED = (
+    _WORDS[kind]
+    for kind in ("truth", "commanded", "actor", "no_pictures", "optical", "bodies", "gimbal", "ned")
+)
+_GENERIC = TRUTH_WORDS | _WORDS["generic"]
 _GENERIC_NUMBERED = re.compile(
     r"(?i)(?<![^\W_])(?:rosbag2|ros[12]|px4|halpe26|coco17|coco133|body25b?|blazepose33|[hx]26[45]|[23]d|\d{3,4}p|\d+fps)"
     r"(?![^\W_])"
@@ -157,20 +151,6 @@ def unique(name: str, taken: Sequence[str]) -> str:
         candidate = f"{name[:58]}_{number}"
         number += 1
     return candidate
-
-
-COMMANDED = frozenset(
-    {"setpoint", "setpoints", "cmd", "command", "commanded", "desired", "goal", "reference", "target"}
-    | {"plan", "planned", "planner", "waypoint", "waypoints"}
-)
-ACTOR = frozenset(
-    {"actor", "person", "people", "human", "subject", "pedestrian", "runner", "athlete", "watch"}
-)
-NO_PICTURES = frozenset({"depth", "disparity", "infra", "mask", "segmentation", "confidence"})
-OPTICAL = frozenset({"camera", "cam", "optical", "lens"})
-BODIES = frozenset({"base", "body", "imu", "fcu"})
-GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "pantilt", "ptz", "payload", "camera", "cam"})
-NED = frozenset({"ned", "px4", "fmu"})
 
 
 # --- candidates -------------------------------------------------------------------------------------------

@@ -230,53 +230,6 @@ class Interpolation(Entry):
         return round(self.max_extrapolation_s * 1e9)
 
 
-DOUBT_CODES = {
-    "videos_swapped": ("A camera has the pictures or keypoints of another one.", "video, keypoints"),
-    "mirrored": (
-        "Keypoints were found in mirrored pictures, or have left for right in names.",
-        "keypoints.mirrored",
-    ),
-    "convention": (
-        "Poses are camera_from_world, quaternions begin with w, or poses are of the body and not the camera.",
-        "pose.inverse, pose.quaternion, pose.of",
-    ),
-    "axes": ("The log is in NED, or its z or body axes differ.", "pose.axes, pose.z, mount"),
-    "unit": ("Positions are in feet, centimetres or millimetres.", "pose.unit"),
-    "level": ("The world's z does not point up.", "world.up, pose.world_from_source"),
-    "scale": (
-        "All positions are larger or smaller than they should be.",
-        "world.scale, pose.world_from_source",
-    ),
-    "mount": (
-        "The camera is rolled, looks another way, or tilts up instead of down.",
-        "mount, pose.attitude",
-    ),
-    "gimbal": (
-        "The angles of gimbals are in other axes, or relative to something else.",
-        "gimbal.axes, gimbal.relative_to",
-    ),
-    "intrinsics": ("The focal length is that of another picture size or camera.", "intrinsics"),
-    "keypoints_size": (
-        "Keypoints were found in pictures of another size.",
-        "keypoints.image_size, intrinsics",
-    ),
-    "clock": ("The pictures were taken earlier or later than stated.", "clock.offset_s"),
-    "frame_rate": ("The pictures follow each other faster or slower than stated.", "frame_times.fps"),
-    "origin": ("A log has its zero or its north elsewhere than the others.", "pose.world_from_source"),
-    "pose": (
-        "One camera does not fit the others: its heading, its topic, or errors larger than stated.",
-        "mount, pose.topic, gimbal.topic, pose_noise",
-    ),
-    "unused": ("A log holds the angles of a gimbal that nothing uses.", "gimbal"),
-    "noise": ("Errors of all poses are larger than stated.", "pose_noise"),
-    "body": ("The person has not the size, limbs, posture or speed of people.", ""),
-    "ground": ("The feet are not on the ground, or the person is above the drones.", ""),
-    "actor": ("The person is not where the actor was logged.", ""),
-    "residual": ("The rays miss each other by more than is stated of keypoints and poses.", ""),
-}
-"""The codes of doubts: what each means, and the keys of flight.yaml that its remedy changes."""
-
-
 class Doubt(Entry):
     """A contradiction in a flight, as session.json and metrics.json hold it."""
 

@@ -8,6 +8,7 @@ midpoint of the hips; BlazePose's `foot_index`, the tip of the foot, is called `
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from pipelines.geometry.poses import interpolate_points
 from pipelines.session.description import Description
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion
+from pipelines.session.storage import own_table
 from pipelines.session.tables import ACTOR, read_table
 
 Bone = tuple[str, str]
@@ -52,31 +54,8 @@ def mirrored(joint: str) -> str:
     return joint
 
 
-_LEFT_BONES: tuple[Bone, ...] = (
-    ("left_shoulder", "left_elbow"),
-    ("left_elbow", "left_wrist"),
-    ("left_wrist", "left_pinky"),
-    ("left_wrist", "left_index"),
-    ("left_wrist", "left_thumb"),
-    ("left_shoulder", "left_hip"),
-    ("left_hip", "left_knee"),
-    ("left_knee", "left_ankle"),
-    ("left_ankle", "left_heel"),
-    ("left_ankle", "left_big_toe"),
-    ("left_big_toe", "left_small_toe"),
-    ("nose", "left_eye"),
-    ("left_eye_inner", "left_eye"),
-    ("left_eye", "left_eye_outer"),
-    ("left_eye", "left_ear"),
-)
-_MIDDLE_BONES: tuple[Bone, ...] = (
-    ("left_shoulder", "right_shoulder"),
-    ("left_hip", "right_hip"),
-    ("left_mouth", "right_mouth"),
-    ("neck", "head"),
-    ("neck", "nose"),
-    ("hip", "neck"),
-)
+_TABLES: dict[str, dict[str, Any]] = own_table(__file__, "skeletons")
+_LEFT_BONES, _MIDDLE_BONES = (tuple(map(tuple, _TABLES["bones"][part])) for part in ("left", "middle"))
 _ALL_BONES = (*_MIDDLE_BONES, *_LEFT_BONES, *((mirrored(a), mirrored(b)) for a, b in _LEFT_BONES))
 
 
@@ -86,51 +65,8 @@ def bones_of(joints: tuple[str, ...]) -> tuple[Bone, ...]:
     return tuple(bone for bone in _ALL_BONES if there.issuperset(bone))
 
 
-def _both(*parts: str) -> tuple[str, ...]:
-    """List the left and the right joint of each part, side by side."""
-    return tuple(f"{side}_{part}" for part in parts for side in ("left", "right"))
-
-
-def _one_side(side: str, *parts: str) -> tuple[str, ...]:
-    return tuple(f"{side}_{part}" for part in parts)
-
-
-_COCO17 = ("nose", *_both("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"))
-
-_ARMS = (*_one_side("right", "shoulder", "elbow", "wrist"), *_one_side("left", "shoulder", "elbow", "wrist"))
-_FEET = tuple(f"{side}_{part}" for side in ("left", "right") for part in ("big_toe", "small_toe", "heel"))
-_JOINTS: dict[str, tuple[str, ...]] = {
-    "coco17": _COCO17,
-    "halpe26": (*_COCO17, "head", "neck", "hip", *_both("big_toe", "small_toe", "heel")),
-    "coco18": (
-        *("nose", "neck"),
-        *_ARMS,
-        *_one_side("right", "hip", "knee", "ankle"),
-        *_one_side("left", "hip", "knee", "ankle"),
-        *("right_eye", "left_eye", "right_ear", "left_ear"),
-    ),
-    "body25": (
-        *("nose", "neck"),
-        *_ARMS,
-        "hip",
-        *_one_side("right", "hip", "knee", "ankle"),
-        *_one_side("left", "hip", "knee", "ankle"),
-        *("right_eye", "left_eye", "right_ear", "left_ear"),
-        *_FEET,
-    ),
-    "coco23": (*_COCO17, *_FEET),
-    "body25b": (*_COCO17, "neck", "head", *_FEET),
-    "blazepose33": (
-        "nose",
-        *_one_side("left", "eye_inner", "eye", "eye_outer"),
-        *_one_side("right", "eye_inner", "eye", "eye_outer"),
-        *_both("ear", "mouth", "shoulder", "elbow", "wrist", "pinky", "index", "thumb"),
-        *_both("hip", "knee", "ankle", "heel", "big_toe"),
-    ),
-}
-
 SKELETONS: dict[str, Skeleton] = {
-    name: Skeleton(name, joints, bones_of(joints)) for name, joints in _JOINTS.items()
+    name: Skeleton(name, tuple(joints), bones_of(tuple(joints))) for name, joints in _TABLES["joints"].items()
 }
 """Every skeleton by the name that `flight.yaml` uses; of two with equal counts the likelier comes first."""
 
@@ -150,7 +86,7 @@ def _ways_to_write(joint: str) -> list[str]:
 
 
 _CALLED = _ALSO_CALLED | {
-    way: joint for joints in _JOINTS.values() for joint in joints for way in _ways_to_write(joint)
+    way: joint for each in SKELETONS.values() for joint in each.joints for way in _ways_to_write(joint)
 }
 
 

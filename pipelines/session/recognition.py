@@ -7,13 +7,21 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, Format
-from pipelines.session.storage import files_in, is_folder, plain_text, refuse_special, text_encoding
+from pipelines.session.storage import (
+    files_in,
+    is_folder,
+    own_table,
+    plain_text,
+    refuse_special,
+    text_encoding,
+)
 
 F = TypeVar("F")
 
@@ -99,52 +107,12 @@ _AS_RECORD = (
 )
 _COPY = "it is damaged or of another kind: copy it again from where it was recorded"
 
-# Kinds that are known by their first bytes but not read, and the step that makes them usable.
-_UNREAD = (
-    (re.compile(rb"\xff\xd8\xff"), "a JPEG picture", "of a sequence of pictures, name the folder"),
-    (re.compile(rb"\x89PNG\r\n"), "a PNG picture", "of a sequence of pictures, name the folder"),
-    (re.compile(rb"P[1-6]\s"), "a PGM picture", "of a floor plan, name the .yaml beside it"),
-    (re.compile(rb"(?s).{4}ftyp|\x1aE\xdf\xa3|RIFF....AVI "), "a video without pictures", _COPY),
-    (re.compile(rb"%PDF"), "a PDF document", ""),
-    (re.compile(rb"\x37\x7f\x06[\x82\x83]"), "the write-ahead log of a database", "name the .db3 beside it"),
-    (re.compile(rb"PK\x03\x04.{26}[\w.-]{1,60}\.npy", re.DOTALL),
-     "a NumPy archive of other arrays than a map's",
-     "a map has probability or occupancy, origin and resolution_m; save a calibration as YAML, poses as CSV"),
-    (re.compile(rb"\x93NUMPY"), "a NumPy array without names and times",
-     "write joints as CSV: time, nose_x, nose_y, nose_z, ... (FreeMoCap does beside its .npy)"),
-    (re.compile(rb"PK\x03\x04"), "a ZIP archive", "unpack it"),
-    (re.compile(rb"ASTM-E57"), "an E57 point cloud", "convert it to LAS or PLY (CloudCompare does)"),
-    (re.compile(rb"II\*\0|MM\0\*"), "a TIFF picture",
-     "save a sequence of pictures as JPEG or PNG, a height model as points (LAS, PLY)"),
-    (re.compile(rb"(?:\s*(?:#|mtllib|o |g )[^\n]*\n)*\s*v\s+-?[\d.]+\s|solid [^\n]*\n\s*facet"),
-     "a mesh (OBJ or STL)", "sample points of it, and save them as PLY (CloudCompare does)"),
-    (re.compile(rb"glTF"), "a glTF scene", "sample points of a map, and save them as PLY"),
-    (re.compile(rb"RRF\d"), "a recording of Rerun", "name the log or the session that it was made of"),
-    (re.compile(rb"\x80[\x02-\x05].*\.$", re.DOTALL), "a pickle of Python", "save its arrays as CSV"),
-    (re.compile(rb"(?:\xef\xbb\xbf)?WEBVTT"), "subtitles as WebVTT", "convert them to .srt (FFmpeg does)"),
-    (re.compile(rb"\x1f\x8b"), "a gzip archive", "unpack it"),
-    (re.compile(rb"7z\xbc\xaf|Rar!"), "an archive", "unpack it"),
-    (re.compile(rb"\x89HDF|MATLAB 5"), "an HDF5 or MATLAB file",
-     "save it as CSV: DeepLabCut by analyze_videos_converth5_to_csv, SLEAP by Export Analysis CSV"),
-    (re.compile(rb"(?s).{,2000}\bendheader\s"), "a table of OpenSim (STO, MOT)", "give markers, as .trc"),
-    (re.compile(rb"PAR1"), "a Parquet table", "export it as CSV"),
-    (re.compile(rb"SQLite format 3"), "an SQLite database without the tables of a bag", ""),
-    (re.compile(rb"Kaydara FBX"), "an FBX scene", "export its motion as BVH"),
-    (re.compile(rb"(?s)\s*(?:<\?xml.*?\?>\s*)?<calibration\b.*<camera "), "a Qualisys calibration (XML)",
-     "convert it to TOML with Pose2Sim's calibration step"),
-    (re.compile(rb"(?s)(#[^\n]*\n)*\s*:(?:version\b.{,4000}:root|FULLY-SPECIFIED)"),
-     "Acclaim motion (ASF/AMC)", "convert it to BVH or C3D"),
-    (re.compile(rb"(?:\xef\xbb\xbf)?\[Script Info\]"), "subtitles as ASS, which Autel's drones write",
-     "write their positions as a CSV of poses"),
-    (re.compile(rb"(?s).{,400}<kml\b|.{,400}<TrainingCenterDatabase\b|.{8}\.FIT"),
-     "a track of a watch or a map program (KML, TCX or FIT)", "export it as GPX"),
-    (re.compile(rb"\$G[A-Z]{4},"), "a receiver's log (NMEA)",
-     "write its places as sensor_msgs/NavSatFix into a log"),
-    (re.compile(rb"# Camera list|# Image list|# 3D point list"), "one file of a COLMAP model",
-     "name the folder that holds it"),
-    (re.compile(rb"(?s).{,200}rosbag2_bagfile_information:"), "the metadata of a ROS 2 bag",
-     "name the bag's folder"),
-)  # fmt: skip
+
+@cache
+def _unread_kinds() -> list[tuple[re.Pattern[bytes], str, str]]:
+    """Return the kinds that are known by their first bytes but not read, and what makes them usable."""
+    kinds = own_table(__file__, "unread")["kind"]
+    return [(re.compile(each["begins"].encode()), each["is"], each.get("remedy", "")) for each in kinds]
 
 
 # DJI's binary records, by the drone's signatures (DatCon), by the app's prefix (dji-log-parser: place and
@@ -212,7 +180,7 @@ def _of_bytes(path: Path, head: bytes) -> Likeness | None:
         ways = "Airdata, PhantomHelp, Flight Reader or dji-log-parser"
         remedy = f"convert it to CSV ({ways}) and give that: pose: {{file: RECORD.csv}}"
         return Likeness("is DJI's binary flight record, which mocap does not decode", remedy)
-    for pattern, kind, remedy in _UNREAD:
+    for pattern, kind, remedy in _unread_kinds():
         if pattern.match(head):
             return Likeness(f"is {kind}", remedy)
     is_control = any(c < 32 and c not in b"\t\n\f\r" for c in head)

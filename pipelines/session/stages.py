@@ -50,9 +50,6 @@ from pipelines.session.storage import (
     write_json,
 )
 
-STAGES = ("ingest", "detect", "background", "reconstruct", "replan", "film", "report")
-"""The stages in the order in which they may run."""
-
 COMMANDS = {
     "ingest": "mocap ingest",
     "detect": "mocap reconstruct",
@@ -62,7 +59,9 @@ COMMANDS = {
     "film": "mocap replan-compare --render 5",
     "report": "mocap report",
 }
-"""The command that makes each stage."""
+"""The command that makes each stage, in the order in which they may run."""
+
+STAGES = tuple(COMMANDS)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import stat
+import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -29,32 +30,25 @@ CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 # Spreadsheets and some editors begin a file with one of these marks.
 _UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
-_REMEDIES = {
-    errno.ENOENT: "check the path; those in a flight.yaml are relative to it",
-    errno.ENOSPC: "free some space and run the command again",
-    errno.EDQUOT: "free some space and run the command again",
-    errno.EACCES: "check its permissions, or choose another place with --output",
-    errno.EPERM: "check its permissions, or choose another place with --output",
-    errno.EROFS: "choose another place with --output, or copy it to where files can be written",
-}
-
-_CODES = {
-    errno.ENOENT: "no-such-file",
-    errno.ENOTDIR: "not-a-folder",
-    errno.EISDIR: "not-a-folder",
-    errno.ENOSPC: "disk-full",
-    errno.EDQUOT: "disk-full",
-    errno.EACCES: "no-permission",
-    errno.EPERM: "no-permission",
-    errno.EROFS: "no-permission",
-    errno.ENOMEM: "out-of-memory",
+_SPACE = ("disk-full", "free some space and run the command again")
+_PERMISSIONS = ("no-permission", "check its permissions, or choose another place with --output")
+_MEND = "mend that and run the command again"
+_ERRORS = {  # code and remedy
+    errno.ENOENT: ("no-such-file", "check the path; those in a flight.yaml are relative to it"),
+    **dict.fromkeys((errno.ENOTDIR, errno.EISDIR), ("not-a-folder", _MEND)),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), _SPACE),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), _PERMISSIONS),
+    errno.EROFS: (
+        "no-permission",
+        "choose another place with --output, or copy it to where files can be written",
+    ),
+    errno.ENOMEM: ("out-of-memory", _MEND),
 }
 
 
 def as_data_error(error: OSError, path: Path) -> DataError:
     """Make a one-line error of an operating system's error; `path` is used if the error names no file."""
-    remedy = _REMEDIES.get(error.errno or 0, "mend that and run the command again")
-    code = _CODES.get(error.errno or 0, "unreadable")
+    code, remedy = _ERRORS.get(error.errno or 0, ("unreadable", _MEND))
     return DataError(error.filename or path, error.strerror or str(error), remedy, code=code)
 
 
@@ -166,6 +160,11 @@ def read_text(path: Path, *, most_bytes: int | None = None) -> str:
         problem = f"is not UTF-8 text (byte {error.start})"
         remedy = "name a text file here, or save it as UTF-8"
         raise DataError(path, problem, remedy, code="damaged") from error
+
+
+def own_table(module: str, name: str) -> dict[str, Any]:
+    """Read a TOML file of this program, which lies in the folder `data` beside a module."""
+    return tomllib.loads((Path(module).parent / "data" / f"{name}.toml").read_text(encoding="utf-8"))
 
 
 def sha256_of(path: Path) -> str:

@@ -27,112 +27,44 @@ from pipelines.session.records import (
     MovingBody,
     Trajectory,
 )
-from pipelines.session.storage import as_data_error, refuse_special
+from pipelines.session.storage import as_data_error, own_table, refuse_special
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow.parquet as pq
 
-_T_NS, _CAMERA, _PERSON = ("t_ns", pa.int64()), ("camera", pa.string()), ("person", pa.int64())
-_FRAME, _JOINT, _STATUS = ("frame", pa.int64()), ("joint", pa.string()), ("status", pa.string())
-_XY, _XYZ = ([(name, pa.float64()) for name in names] for names in ("xy", "xyz"))
-_POSE = [*_XYZ, *((name, pa.float64()) for name in ("qx", "qy", "qz", "qw"))]
+TABLES: dict[str, dict[str, Any]] = own_table(__file__, "tables")
+"""File, columns and content of each table of a session, by the name of its schema here."""
+
+
+def _schema(name: str) -> pa.Schema:
+    columns = TABLES[name]["columns"]
+    return pa.schema([(column, kind) for kind, words in columns for column in words.split()])
+
+
+FRAMES = _schema("FRAMES")
+POSES = _schema("POSES")
+KEYPOINTS = _schema("KEYPOINTS")
+TRACKS = _schema("TRACKS")
+ACTOR = _schema("ACTOR")
+TRUTH = _schema("TRUTH")
+CAMERA_POSES = _schema("CAMERA_POSES")
+PLAN = _schema("PLAN")
+SKELETON = _schema("SKELETON")
+ANGLES = _schema("ANGLES")
+GAIT = _schema("GAIT")
+BODY = _schema("BODY")
+BODY_SHAPE = _schema("BODY_SHAPE")
+JOINT_ERRORS = _schema("JOINT_ERRORS")
+BONES = _schema("BONES")
+REPLAN = _schema("REPLAN")
+
 COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
 """Upper triangle of a pose covariance: position in world, rotation vector in camera."""
-
-FRAMES = pa.schema([_FRAME, _T_NS, ("pts_ns", pa.int64())])
-"""cameras/<camera>/frames.parquet: the pictures in world time, and their stamps in the video."""
-POSES = pa.schema([_T_NS, *_POSE])
-"""cameras/<camera>/poses.parquet: world_from_camera at the log's rate; `c00` to `c55` if the log has
-covariances (upper triangle; position in world in m, rotation vector in camera in rad), `body_qx` to `body_qw`
-if a gimbal turns the camera."""
 BODY_COLUMNS = ("body_qx", "body_qy", "body_qz", "body_qw")
 POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
-KEYPOINTS = pa.schema([_FRAME, _T_NS, _PERSON, _JOINT, *_XY, ("confidence", pa.float64())])
-"""cameras/<camera>/keypoints.parquet: imported keypoints, px; `detect/<camera>/keypoints.parquet` has
-those of our detector."""
-TRACKS = pa.schema([_FRAME, ("point", pa.int32()), ("x", pa.float32()), ("y", pa.float32())])
-"""background/<camera>/tracks.parquet: points of the background in the pictures, px, sorted by frame."""
-
-ACTOR = pa.schema([_T_NS, _PERSON, *_XYZ])
-"""actor.parquet: the logged point of each person."""
-TRUTH = pa.schema([_T_NS, _PERSON, _JOINT, *_XYZ])
-"""truth.parquet: the true joints."""
-CAMERA_POSES = pa.schema([_T_NS, _CAMERA, *_POSE])
-"""truth_poses.parquet: the true world_from_camera; `reconstruct/cameras.parquet` has the corrected one."""
-
-PLAN = pa.schema([_T_NS, _CAMERA, *_XYZ])
-"""plan.parquet: the setpoints of the on-board planner for every drone."""
-
-SKELETON = pa.schema(
-    [
-        *(_T_NS, _PERSON, _JOINT, *_XYZ),
-        *((name, pa.float64()) for name in POINT_COVARIANCE_COLUMNS),
-        ("views", pa.int64()),
-        ("reprojection_px", pa.float64()),
-        _STATUS,
-    ]
-)
-"""reconstruct/skeleton.parquet: every joint of every person at every time, sorted by time, person, joint."""
-
-ANGLES = pa.schema(
-    [
-        *(_T_NS, _PERSON, ("angle", pa.string())),
-        *((name, pa.float64()) for name in ("value_deg", "sigma_deg")),
-        _STATUS,
-    ]
-)
-"""reconstruct/angles.parquet: every joint angle, sorted by time, then person; NaN unless its status is ok or
-filled."""
-GAIT = pa.schema(
-    [
-        *(_T_NS, _PERSON, ("side", pa.string()), ("event", pa.string())),
-        *(*_XYZ, *((name, pa.float64()) for name in ("step_s", "step_m", "speed_mps"))),
-    ]
-)
-"""reconstruct/gait.parquet: heel strikes and toe-offs of people who walk, with the place of heel or toe."""
-
 BODY_ROTATION_COLUMNS = ("r00", "r01", "r02", "r11", "r12", "r22")
 """Upper triangle of the covariance of a bone's rotation, rad^2, of a rotation vector in the world."""
-BODY = pa.schema(
-    [
-        *(_T_NS, _PERSON, ("bone", pa.string()), *_XYZ),
-        *((name, pa.float64()) for name in POINT_COVARIANCE_COLUMNS),
-        *_POSE[3:],
-        *((name, pa.float64()) for name in BODY_ROTATION_COLUMNS),
-    ]
-)
-"""reconstruct/body.parquet: the bones of each person's body: centre of the upper joint, and world_from_bone
-relative to the neutral pose, with covariances, sorted by time, then person; `truth_body.parquet` has the true
-ones."""
-BODY_SHAPE = pa.schema([_PERSON, ("number", pa.string()), ("value", pa.float64()), ("sigma", pa.float64())])
-"""reconstruct/body_shape.parquet: the stature (m) and eleven other numbers of each person's shape, and their
-standard deviations; `truth_body_shape.parquet` has the true ones."""
-
-JOINT_ERRORS = pa.schema(
-    [_JOINT, ("figure", pa.string()), *((name, pa.float64()) for name in ("value", "low", "high"))]
-)
-"""reconstruct/joint_errors.parquet: each figure of metrics.json for a single joint, and its 95 % interval."""
-
-BONES = pa.schema(
-    [("bone", pa.string()), ("median_mm", pa.float64()), ("spread_mm", pa.float64()), ("frames", pa.int64())]
-)
-"""reconstruct/bones.parquet: the reconstructed length of each bone and its spread over the flight."""
-
-_SLOT = ("formation_yaw_rad", "slot_yaw_rad", "slot_tilt_rad", "slot_range_m", "tilt_rad")
-REPLAN = pa.schema(
-    [
-        *(_T_NS, _CAMERA, *_POSE),
-        *((name, pa.float64()) for name in _SLOT),
-        ("visible", pa.bool_()),
-        ("predicted_error_m", pa.float64()),
-        ("known", pa.bool_()),
-    ]
-)
-"""replan/<arm>/trajectories.parquet: the pose (world_from_camera), the commanded
-slot (yaw continuous, NaN for the flown trajectories), the tilt above the actor, `visible` (True if nothing
-blocks the sight line), the predicted error of all cameras together (NaN where not determined), and `known`
-(False where a log has a gap, or a battery is empty: no pictures there)."""
 
 
 def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:

@@ -30,7 +30,8 @@ from pipelines.geometry.body_model import (
 from pipelines.geometry.poses import multiply
 from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig
 from pipelines.session.people import get_skeleton
-from pipelines.simulation.raster import TriangleSurface
+from pipelines.session.storage import own_table
+from pipelines.simulation.raster import TriangleSurface, normals
 from pipelines.simulation.scenario import Body
 
 
@@ -49,18 +50,6 @@ class Patch:
 def triangles(quads: Index) -> Index:
     """Split quads [Q, 4] into triangles [2 Q, 3]."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-
-
-def normals(vertices: Float, faces: Index) -> Float:
-    """Compute outward unit normals [V, 3], means over the triangles around by area; zero where none are."""
-    across = np.cross(
-        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
-    )
-    total = np.zeros_like(vertices)
-    for corner in faces.T:
-        np.add.at(total, corner, across)
-    unit: Float = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
-    return unit
 
 
 def cut(patch: Patch, keep: Float) -> Patch:
@@ -149,48 +138,7 @@ class Outfit:
     hair: Colour
 
 
-OUTFITS = {
-    "casual": Outfit(
-        sleeve=0.6,
-        leg=1.93,
-        shirt=(0.42, 0.06, 0.05),
-        trousers=(0.05, 0.08, 0.2),
-        shoes=(0.2, 0.19, 0.18),
-        soles=(0.7, 0.7, 0.66),
-        skin=(0.5, 0.31, 0.22),
-        hair=(0.035, 0.02, 0.012),
-    ),
-    "sport": Outfit(
-        sleeve=0.45,
-        leg=0.72,
-        shirt=(0.06, 0.3, 0.62),
-        trousers=(0.05, 0.05, 0.06),
-        shoes=(0.65, 0.08, 0.06),
-        soles=(0.75, 0.75, 0.75),
-        skin=(0.33, 0.18, 0.115),
-        hair=(0.012, 0.009, 0.008),
-    ),
-    "dark": Outfit(
-        sleeve=1.93,
-        leg=1.93,
-        shirt=(0.025, 0.027, 0.03),
-        trousers=(0.035, 0.035, 0.042),
-        shoes=(0.02, 0.02, 0.02),
-        soles=(0.03, 0.03, 0.03),
-        skin=(0.5, 0.31, 0.22),
-        hair=(0.02, 0.014, 0.01),
-    ),
-    "bright": Outfit(
-        sleeve=1.93,
-        leg=1.93,
-        shirt=(0.8, 0.36, 0.03),
-        trousers=(0.55, 0.5, 0.41),
-        shoes=(0.6, 0.6, 0.6),
-        soles=(0.3, 0.2, 0.12),
-        skin=(0.55, 0.36, 0.27),
-        hair=(0.16, 0.09, 0.035),
-    ),
-}
+OUTFITS = {name: Outfit(**outfit) for name, outfit in own_table(__file__, "outfits").items()}
 _LIPS, _BROW, _WHITE, _IRIS = (0.36, 0.13, 0.11), (0.04, 0.025, 0.015), (0.7, 0.7, 0.68), (0.05, 0.04, 0.03)
 _SOCKS = (0.65, 0.65, 0.65)
 

@@ -3,10 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float
+from pipelines.session.storage import own_table
 
 # People walk at this speed if no other one is stated; the curves of feet and knees were fitted at it.
 WALK_SPEED_MPS = 1.3
@@ -23,25 +25,9 @@ _LEG_OF_WALK_RATIO_M = 0.93
 # A first or last step takes no longer than at this cadence.
 _SLOWEST_CADENCE = 1.1
 
-# Foot against the ground in stance: share of stance and degrees, toes up; the strike and the lift are added.
-_STANCE_WALK = ((0.13, 0.0), (0.34, 0.0), (0.66, -11.5), (0.78, -16.5))
-_STANCE_RUN = ((0.20, 0.0), (0.47, 0.0), (0.60, -8.0), (0.82, -33.0))
+_GAITS = own_table(__file__, "gait")
 # In walking strides longer than that at 1.3 m/s the heel rises farther, by a share of the extra length.
 _USUAL_STRIDE, _LONG_STRIDE_LIFTS = 1.09, 0.8
-# And in swing.
-_SWING_WALK = ((0.08, -71.5), (0.19, -65.0), (0.55, -16.5), (0.80, 16.0), (0.90, 20.0))
-_SWING_RUN = ((0.15, -80.0), (0.38, -84.0), (0.60, -48.0), (0.80, -6.0), (0.93, 10.0))
-_STRIKE_DEG, _LIFT_DEG = (17.5, 8.0), (-61.0, -66.0)  # walking, running
-# Height of the lowest point of the foot in swing, m.
-_CLEARANCE_WALK = ((0.05, 0.006), (0.20, 0.026), (0.40, 0.014), (0.60, 0.023), (0.80, 0.027), (0.95, 0.009))
-_CLEARANCE_RUN = ((0.05, 0.0078), (0.18, 0.05), (0.40, 0.12), (0.60, 0.10), (0.80, 0.05), (0.94, 0.0070))
-# Share of its way that the foot has come in swing.
-_ONWARD_WALK = ((0.2, 0.14), (0.4, 0.42), (0.6, 0.68), (0.8, 0.93))
-_ONWARD_RUN = ((0.2, 0.074), (0.4, 0.336), (0.6, 0.664), (0.8, 0.926))
-# Share of the swing from which a leg reaches the ground; share of the bend at lift that the toes keep.
-_CARRIES, _TOES = (0.97, 0.90), (1.0, 0.0)  # walking, running
-# The least flexion of the knee in stance, degrees.
-_KNEE_WALK = ((0.0, 1.5), (0.22, 17.5), (0.42, 9.0), (0.62, 5.0), (0.76, 8.5), (1.0, 18.0))
 
 
 def running_share(speed_mps: float) -> float:
@@ -85,28 +71,29 @@ class Roll:
 def roll(run: float, before: float, after: float) -> Roll:
     """Compute the roll of a foot (`run` 0 walks, 1 runs) between swings of shares of a full stride."""
 
-    def mix(walk: tuple[tuple[float, float], ...], jog: tuple[tuple[float, float], ...]) -> list[list[float]]:
-        mixed: list[list[float]] = ((1 - run) * np.array(walk) + run * np.array(jog)).tolist()
-        return mixed
+    def mix(name: str) -> Any:
+        walk, jog = np.array(_GAITS["walk"][name]), np.array(_GAITS["run"][name])
+        return ((1 - run) * walk + run * jog).tolist()
 
     came, goes = (float(np.sin(np.pi / 2 * min(share, 1.0))) for share in (before, after))
     toes_up = (1 - run) * min(before, 1.0) + run * came
     heel_up = goes * (1 + (1 - run) * _LONG_STRIDE_LIFTS * max(after - _USUAL_STRIDE, 0.0))
     return Roll(
-        strike_deg=toes_up * ((1 - run) * _STRIKE_DEG[0] + run * _STRIKE_DEG[1]),
-        lift_deg=heel_up * ((1 - run) * _LIFT_DEG[0] + run * _LIFT_DEG[1]),
-        stance_deg=tuple((share, heel_up * angle) for share, angle in mix(_STANCE_WALK, _STANCE_RUN)),
+        strike_deg=toes_up * mix("strike_deg"),
+        lift_deg=heel_up * mix("lift_deg"),
+        stance_deg=tuple((share, heel_up * angle) for share, angle in mix("stance_deg")),
         swing_deg=tuple(
-            (share, angle * (toes_up if angle > 0 else goes)) for share, angle in mix(_SWING_WALK, _SWING_RUN)
+            (share, angle * (toes_up if angle > 0 else goes)) for share, angle in mix("swing_deg")
         ),
         clearance_m=tuple(
-            (share, high * (goes if run > 0.5 else 0.6 + 0.4 * goes))
-            for share, high in mix(_CLEARANCE_WALK, _CLEARANCE_RUN)
+            (share, high * (goes if run > 0.5 else 0.6 + 0.4 * goes)) for share, high in mix("clearance_m")
         ),
-        onward=tuple((share, there) for share, there in mix(_ONWARD_WALK, _ONWARD_RUN)),
-        carries=(1 - run) * _CARRIES[0] + run * _CARRIES[1],
-        toes=(1 - run) * _TOES[0] + run * _TOES[1],
-        knee_deg=tuple((share, 4.0 + (angle - 4.0) * (1 - run) * came) for share, angle in _KNEE_WALK),
+        onward=tuple((share, there) for share, there in mix("onward")),
+        carries=mix("carries"),
+        toes=mix("toes"),
+        knee_deg=tuple(
+            (share, 4.0 + (angle - 4.0) * (1 - run) * came) for share, angle in _GAITS["walk"]["knee_deg"]
+        ),
     )
 
 

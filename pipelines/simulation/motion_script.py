@@ -9,6 +9,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.geometry.rig import BONE, BONES, SIDES, BodyMotion, Rig, about, from_axes, partly, unit
+from pipelines.session.storage import own_table
 from pipelines.simulation.motion_plan import (
     FASTEST_WALK_MPS,
     JOG_SPEED_MPS,
@@ -524,40 +525,6 @@ def reach(plan: Plan, side: str, height_m: float, seconds: float, shoulder_m: fl
     plan.stay(end - plan.t_s)
 
 
-# Of a right-footed instep kick: seconds from the plant of the support foot, degrees. The thigh is measured
-# from straight down in a plane that leans out from the turned pelvis, forward is positive.
-_KICK_LEG = {
-    "kick_thigh_deg": (
-        *((-0.14, -16.0), (-0.01, -32.0), (0.06, -26.0), (0.12, 5.0), (0.17, 25.0)),
-        *((0.22, 37.0), (0.36, 62.0), (0.50, 42.0), (0.66, 14.0)),
-    ),
-    "kick_knee_deg": (
-        *((-0.14, 45.0), (-0.01, 86.0), (0.065, 104.0), (0.125, 92.0), (0.195, 32.0)),
-        *((0.23, 10.0), (0.31, 6.0), (0.40, 16.0), (0.52, 34.0), (0.66, 20.0)),
-    ),
-    "kick_out_deg": ((-0.14, 0.0), (0.05, 20.0), (0.20, 20.0), (0.36, 6.0), (0.66, 0.0)),
-    "kick_ankle_deg": ((-0.14, -14.0), (0.0, -20.0), (0.24, -20.0), (0.42, -12.0), (0.66, 0.0)),
-}
-_KICK_TRUNK = {  # angles to the left are positive
-    "pelvis_yaw_deg": ((-0.3, 0.0), (0.01, -28.0), (0.19, 10.0), (0.34, 24.0), (0.65, 6.0), (1.0, 0.0)),
-    "chest_yaw_deg": ((-0.3, 0.0), (0.02, 20.0), (0.20, -8.0), (0.36, -20.0), (0.65, -6.0), (1.0, 0.0)),
-    "side_deg": ((-0.3, 0.0), (0.02, -12.0), (0.18, -17.0), (0.35, -8.0), (0.9, 0.0)),
-}
-_KICK_BEND = {  # the same for either foot
-    "lean_deg": ((-0.3, 0.0), (0.0, -13.0), (0.12, -15.0), (0.25, 2.0), (0.38, 14.0), (0.7, 5.0), (1.0, 0.0)),
-    "tilt_deg": ((-0.3, 0.0), (0.0, 6.0), (0.19, -10.0), (0.34, -12.0), (0.7, 0.0)),
-    "look_deg": ((-0.3, 0.0), (0.0, 24.0), (0.16, 24.0), (0.5, 0.0)),
-}
-_KICK_ARMS = {  # of the support side, of the kicking side
-    "shoulder_deg": (
-        ((-0.3, 0.0), (0.0, -42.0), (0.18, 5.0), (0.35, 48.0), (0.6, 15.0), (1.0, 0.0)),
-        ((-0.3, 0.0), (0.0, 32.0), (0.20, -22.0), (0.36, -40.0), (0.6, -15.0), (1.0, 0.0)),
-    ),
-    "abduct_deg": (
-        ((-0.3, 0.0), (0.0, 68.0), (0.18, 58.0), (0.36, 22.0), (0.6, 8.0), (1.0, 0.0)),
-        ((-0.3, 0.0), (0.0, 12.0), (0.17, 38.0), (0.35, 30.0), (0.6, 10.0), (1.0, 0.0)),
-    ),
-}
 _FASTEST_RUN_UP_MPS, _RUN_UP_MPS2 = 3.3, 2.6
 _AFTER_PLANT_S = (0.22, 0.75)
 # By the impact a kicker has slowed down to this share of the run-up.
@@ -568,12 +535,10 @@ _LIFT_S, _LAND_S, _CLOSE_S, _STAND_S = -0.15, 0.68, 0.78, 1.22
 def kick(plan: Plan, side: str, run_up_m: float) -> None:
     """Plan an instep kick at a ball: run up, plant the other foot, swing back, kick, follow through, stand.
 
-    The angles are read off Lees et al., "The biomechanics of kicking in soccer" (J. Sports Sci. 2010) and
-    Nunome et al., "Three-dimensional kinetic analysis of side-foot and instep soccer kicks" (Med. Sci. Sports
-    Exerc. 2002): the approach at 3 to 4 m/s slows down over the plant foot; the hip is extended by some 30
-    deg and the knee flexed beyond 100 deg after the plant; the pelvis turns through some 40 deg; the knee
-    extends at more than 1,000 deg/s and is still bent at the impact, 0.19 s after the plant; the trunk leans
-    back and to the support foot's side, whose arm is spread behind and comes across.
+    By the sources in data/kick.toml, the approach at 3 to 4 m/s slows down over the plant foot; the hip is
+    extended by some 30 deg and the knee flexed beyond 100 deg after the plant; the pelvis turns through some
+    40 deg; the knee extends at more than 1,000 deg/s and is still bent at the impact, 0.19 s after the plant;
+    the trunk leans back and to the support foot's side, whose arm is spread behind and comes across.
     """
     foot, support = (LEFT, RIGHT) if side == "left" else (RIGHT, LEFT)
     speed = min((2 * _RUN_UP_MPS2 * run_up_m) ** 0.5, _FASTEST_RUN_UP_MPS)
@@ -588,7 +553,7 @@ def kick(plan: Plan, side: str, run_up_m: float) -> None:
     plan.step(foot, plant + _LIFT_S, plant + _LAND_S, end, 0.0)
     plan.step(support, plant + _CLOSE_S, plant + _STAND_S, end, 0.0)
 
-    def write(name: str, curve: tuple[tuple[float, float], ...], sign: float = 1.0) -> None:
+    def write(name: str, curve: Sequence[Sequence[float]], sign: float = 1.0) -> None:
         plan.keys.add(name, *((plant + after, sign * value) for after, value in curve))
 
     names = ("left", "right")
@@ -596,13 +561,14 @@ def kick(plan: Plan, side: str, run_up_m: float) -> None:
     write(f"{names[foot]}_kick", ((_LIFT_S, 0.0), (-0.02, 1.0), (0.36, 1.0), (0.62, 0.0)))
     write("drop", ((-0.25, 0.0), (0.05, 0.025), (0.35, 0.025), (0.70, 0.0)))
     write("aside", ((-0.3, 0.0), (0.05, 0.05), (0.35, 0.05), (0.9, 0.0)), mirror)
-    for name, curve in (_KICK_LEG | _KICK_BEND).items():
+    angles = own_table(__file__, "kick")
+    for name, curve in angles["leg"].items():
         write(name, curve)
-    for name, curve in _KICK_TRUNK.items():
+    for name, curve in angles["trunk"].items():
         write(name, curve, mirror)
-    for name, (of_support, of_foot) in _KICK_ARMS.items():
-        write(f"{names[support]}_{name}", of_support)
-        write(f"{names[foot]}_{name}", of_foot)
+    for side_of, arm in ((support, "support_arm"), (foot, "kicking_arm")):
+        for name, curve in angles[arm].items():
+            write(f"{names[side_of]}_{name}", curve)
     plan.t_s = plant + _STAND_S
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Bytes, Float, Float32, Int32, Intrinsics
+from pipelines.geometry.arrays import Bool, Bytes, Float, Float32, Index, Int32, Intrinsics
 from pipelines.geometry.compilation import cached
 
 
@@ -114,21 +114,22 @@ def _single(surface: TriangleSurface) -> Mesh:
     return Mesh(
         vertices,
         faces,
-        _corner_normals(vertices, faces),
+        normals(vertices, faces).astype(np.float32),
         np.ascontiguousarray(surface.colour, np.float32),
         np.full(len(faces), kind, np.uint8),
     )
 
 
-def _corner_normals(vertices: Float, faces: Int32) -> Float32:
-    a, b, c = (vertices[corner] for corner in faces.T)
-    (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
-    across = np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=1)
-    sums = np.zeros_like(vertices)
-    np.add.at(sums, faces.ravel(), np.repeat(across, 3, axis=0))
-    x, y, z = sums.T
-    length = np.maximum(np.sqrt(x * x + y * y + z * z), 1e-30)
-    return np.asarray(sums / length[:, None], np.float32)
+def normals(vertices: Float, faces: Index | Int32) -> Float:
+    """Compute outward unit normals [V, 3], means over the triangles around by area; zero where none are."""
+    across = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
+    total = np.zeros_like(vertices)
+    for corner in faces.T:
+        np.add.at(total, corner, across)
+    unit: Float = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    return unit
 
 
 _EMPTY = TriangleSurface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))

@@ -23,24 +23,10 @@ from pipelines.geometry.rig import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
+from pipelines.session.storage import own_table
 from pipelines.simulation.motion_script import two_bones
 
-# Names of a bone without side, prefix and separators; the first one that is there is taken.
-_SIDED = {
-    "thigh": ("upleg", "upperleg01", "upperleg", "thigh", "thigh1", "femur", "hip"),
-    "shank": ("leg", "lowerleg01", "lowerleg", "lowleg", "shin", "shin1", "calf", "tibia", "knee"),
-    "foot": ("foot", "ankle"),
-    "toes": ("toebase", "toe", "toes", "toe0", "toe11", "ball"),
-    "upper_arm": ("arm", "upperarm01", "upperarm", "uparm", "shldr", "humerus", "shoulder"),
-    "forearm": ("forearm", "lowerarm01", "lowerarm", "lowarm", "radius", "elbow"),
-    "hand": ("hand", "wrist"),
-    "clavicle": ("clavicle", "collar", "clav", "shoulder", "shoulder01"),
-}
-_MIDDLE = {
-    "pelvis": ("hips", "pelvis", "hip", "root", "lowertorso"),
-    "neck": ("neck", "neck1", "neck01"),
-    "head": ("head",),
-}
+_NAMES = own_table(__file__, "bones")
 _ESSENTIAL_SIDED = ("thigh", "shank", "foot", "upper_arm", "forearm")
 _LIMB_ABOVE = {"shank": "thigh", "foot": "shank", "forearm": "upper_arm"}
 
@@ -57,12 +43,12 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
     for index, name in enumerate(source.bones):
         named.setdefault(_parts_of(name), index)
     found: dict[str, int] = {}
-    for ours, variants in _MIDDLE.items():
+    for ours, variants in _NAMES["in_the_middle"].items():
         _take(found, ours, [named.get(("", variant)) for variant in variants])
     if "pelvis" not in found and source.parent.count(-1) == 1:
         found["pelvis"] = source.parent.index(-1)
     for side in SIDES:
-        for ours, variants in _SIDED.items():
+        for ours, variants in _NAMES["of_a_side"].items():
             free = [named.get((side, v)) for v in variants]
             _take(found, f"{side}_{ours}", [index for index in free if index not in found.values()])
     essential = ["pelvis", *(f"{side}_{bone}" for side in SIDES for bone in _ESSENTIAL_SIDED)]

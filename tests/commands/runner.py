@@ -15,7 +15,7 @@ from typing import Any
 from unittest.mock import patch
 
 from mocap_cli.main import print_error, run
-from pipelines.session.errors import CODES, MocapError
+from pipelines.session.errors import MocapError, read_codes
 from tests.synthetic.flights import SyntheticFlight
 
 MOCAP = str(Path(sys.executable).with_name("mocap"))
@@ -95,7 +95,7 @@ def refused(*arguments: str | Path, code: str | None = None) -> str:
     """
     done = mocap(*arguments)
     line = refusal(done)
-    assert code is None or (code in CODES and done.code == code), (done.code, line)
+    assert code is None or (code in read_codes("errors") and done.code == code), (done.code, line)
     return line
 
 

@@ -26,7 +26,8 @@ from pipelines.reconstruction.doubts.logs import doubts_of_logs
 from pipelines.reconstruction.doubts.scene import Oddity, SceneOfMoments, scene_of
 from pipelines.reconstruction.doubts.score import fit, score
 from pipelines.reconstruction.doubts.turning import Lateness
-from pipelines.session.description import DOUBT_CODES, read_description
+from pipelines.session.description import read_description
+from pipelines.session.errors import read_codes
 from pipelines.session.records import Trajectory
 from tests.commands.runner import refused, succeeds
 from tests.synthetic.described_flights import (
@@ -75,7 +76,7 @@ def doubts_of(manifest: Path) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = json.loads(succeeds("check", manifest, "--json"))["doubts"]
     for doubt in found:
         assert set(doubt) == {"code", "cameras", "what", "evidence", "remedy"}
-        assert doubt["code"] in DOUBT_CODES
+        assert doubt["code"] in read_codes("doubts")
         if tried := doubt["evidence"].get("tried"):  # the remedy
             assert tried["misfit_after"] < tried["misfit_before"]
             assert tried["doubts_after"] == 0

@@ -39,7 +39,7 @@ from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.records import AttitudeTrack, PositionTrack, Telemetry
 from pipelines.session.registries import TelemetryChoice, need
-from pipelines.session.storage import damaged, on_disk
+from pipelines.session.storage import damaged, on_disk, own_table
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log
 # A log defines up to 256 types, and chance makes one definition in 16 MB.
@@ -56,29 +56,7 @@ _LEAP_SECONDS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16))
 """UTC second from which GPS time is ahead by so many seconds (IERS announcements up to 2026)."""
 
 # Number type and scale factor of each format letter (AP_Logger's README).
-_LETTERS: dict[str, tuple[str, float]] = {
-    "b": ("i1", 1),
-    "B": ("u1", 1),
-    "M": ("u1", 1),
-    "h": ("<i2", 1),
-    "H": ("<u2", 1),
-    "c": ("<i2", 1e-2),
-    "C": ("<u2", 1e-2),
-    "i": ("<i4", 1),
-    "I": ("<u4", 1),
-    "e": ("<i4", 1e-2),
-    "E": ("<u4", 1e-2),
-    "L": ("<i4", 1e-7),
-    "g": ("<f2", 1),
-    "f": ("<f4", 1),
-    "d": ("<f8", 1),
-    "q": ("<i8", 1),
-    "Q": ("<u8", 1),
-    "a": ("V64", 0),
-    "n": ("V4", 0),
-    "N": ("V16", 0),
-    "Z": ("V64", 0),
-}
+_LETTERS: dict[str, tuple[str, float]] = own_table(__file__, "dataflash")
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ metres, often both. Angles are those of an FRD body and gimbal in NED.
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import numpy as np
 from pipelines.formats.common.files import read_head
 from pipelines.formats.common.rows import since_epoch_ns
 from pipelines.formats.drone_logs.dji_subtitles import (
+    NAMES,
     DjiRows,
     any_finite,
     attitudes_of_rows,
@@ -38,29 +38,7 @@ _LONGEST_S = 1e6
 _METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "ft": 0.3048, "feet": 0.3048}
 _SECONDS = {"millisecond": 1e-3, "ms": 1e-3, "seconds": 1.0, "s": 1.0}
 _IN_SECONDS = ("osd.flytime",)  # without a unit
-_LENGTHS = {  # the preferred name first
-    "relative": ("height_above_takeoff", "osd.height", "altitude"),
-    "absolute": ("altitude_above_sealevel", "osd.altitude"),
-}
 _ELAPSED = ("time", "osd.flytime")
-_NUMBERS = {
-    "latitude": ("latitude", "osd.latitude"),
-    "longitude": ("longitude", "osd.longitude"),
-    "drone_yaw": ("compass_heading", "osd.yaw", "yaw"),
-    "drone_pitch": ("pitch", "osd.pitch"),
-    "drone_roll": ("roll", "osd.roll"),
-    "gb_yaw": ("gimbal_heading", "gimbal.yaw"),
-    "gb_pitch": ("gimbal_pitch", "gimbal.pitch"),
-    "gb_roll": ("gimbal_roll", "gimbal.roll"),
-}
-_CLOCKS = {  # columns of date and time of day, each with the zone that the heading states
-    "utc": (
-        (("datetime", "utc"),),
-        (("custom.date", "utc"), ("custom.updatetime", "utc")),
-        (("custom.datetime", ""),),
-    ),
-    "local": ((("datetime", "local"),), (("custom.date", "local"), ("custom.updatetime", "local"))),
-}
 _FILMS = ("isvideo", "camera.isvideo", "istakingvideo")
 _HEADING = re.compile(r"([^\[(]+?)\s*(?:[\[(]([^\])]*)[\])]+)?")
 _CLOCK = re.compile(
@@ -85,14 +63,11 @@ class DjiRecordFormat(DroneLog):
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read positions, interpolated where they are repeated, and angles of body and gimbal."""
-        record = _read(path)
-        return telemetry_of_rows(path, record.rows, choice, record.notes)
+        return telemetry_of_rows(path, _read(path)[0], choice)
 
     def read_attitudes(self, path: Path) -> Attitudes:
         """Read the gimbal's angles, also where the drone had no position."""
-        record = _read(path)
-        found = attitudes_of_rows(path, record.rows)
-        return replace(found, notes=tuple(f"{path}: {note}" for note in record.notes))
+        return attitudes_of_rows(path, _read(path)[0])
 
 
 @dataclass(frozen=True)
@@ -108,72 +83,12 @@ class _RecordHeading:
     films: int | None
 
 
-@dataclass(frozen=True)
-class _Record:
-    """Columns of a record, [N] each, NaN where there is no number."""
-
-    path: Path
-    columns: Mapping[str, Float]
-    clock_ns: Int64  # [N] since the epoch, 0 without
-    fine: bool  # the clock shows parts of seconds
-    utc: bool
-    filming: Bool
-    notes: list[str] = field(default_factory=list)
-    dropped: dict[str, int] = field(default_factory=dict)
-
-    @property
-    def placed(self) -> Bool:
-        """[N] True for a position on Earth."""
-        return np.isfinite(self.columns["latitude"]) & np.isfinite(self.columns["longitude"])
-
-    @property
-    def clock(self) -> str:
-        """The zero of the times."""
-        if not self.clock_ns.any():
-            return "the record's start"
-        return "UTC" if self.utc else "local time"
-
-    @cached_property
-    def times(self) -> tuple[Int64, Bool]:
-        """Times [N] in ns, and True where they are known [N]."""
-        shown = self.clock_ns != 0
-        if self.fine or not any_finite(self.columns["elapsed"]):
-            return self.clock_ns, shown
-        elapsed_s = self.columns["elapsed"]
-        known = np.asarray(np.abs(np.nan_to_num(elapsed_s, nan=np.inf)) < _LONGEST_S, dtype=np.bool_)
-        since_ns = np.round(np.where(known, elapsed_s, 0) * 1e9).astype(np.int64)
-        both = np.flatnonzero(shown & known)
-        if not len(both):
-            return since_ns, known
-        ahead_ns = self.clock_ns[both] - since_ns[both]
-        ticks = np.flatnonzero(np.diff(self.clock_ns[both]) > 0) + 1
-        if len(ticks):  # the clock ticked between a row and the one before
-            ahead_ns = ahead_ns[ticks] + np.diff(since_ns[both])[ticks - 1] // 2
-        else:
-            ahead_ns = ahead_ns + 500_000_000
-        return since_ns + int(np.median(ahead_ns - ahead_ns[0])) + int(ahead_ns[0]), known
-
-    @property
-    def rows(self) -> DjiRows:
-        """The rows in the form that all files of DJI's share."""
-        t_ns, timed = self.times
-        placed = {"latitude": np.where(self.placed, self.columns["latitude"], np.nan)}
-        return DjiRows(
-            t_ns, timed, {**self.columns, **placed}, self.clock, zero_is_none=True, dropped=self.dropped
-        )
-
-    @property
-    def films(self) -> list[tuple[int, int]]:
-        """First and last row of every video that was recorded."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.filming, [False]]).astype(np.int8)))
-        return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def recordings_of(path: Path) -> list[tuple[int, int]]:
     """Read first and last time (ns) of every video that a flight record says was recorded."""
-    record = _read(path)
-    t_ns, timed = record.times
-    return [(int(t_ns[a]), int(t_ns[b])) for a, b in record.films if timed[a] and timed[b]]
+    rows, filming = _read(path)
+    edges = np.flatnonzero(np.diff([0, *filming.astype(int), 0]))
+    films = zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True)
+    return [(int(rows.t_ns[a]), int(rows.t_ns[b])) for a, b in films if rows.timed[a] and rows.timed[b]]
 
 
 def _find_heading(text: str) -> _RecordHeading | None:
@@ -190,15 +105,17 @@ def _find_heading(text: str) -> _RecordHeading | None:
     matches = [_HEADING.fullmatch(cell.strip().lower()) for cell in cells]
     names = [(match[1], match[2] or "") if match else ("", "") for match in matches]
     numbers: dict[str, tuple[int, float]] = {}
-    for name, known in _NUMBERS.items():
+    for name, known in NAMES["columns"].items():
         if (column := _column(names, known)) is not None:
             numbers[name] = (column, 1.0)
-    for name, known in _LENGTHS.items():
+    for name, known in NAMES["lengths"].items():
         if found := _measured(names, known, _METRES):
             numbers[name] = found
     if found := _measured(names, _ELAPSED, _SECONDS) or _measured(names, _IN_SECONDS, {"": 1.0}):
         numbers["elapsed"] = found
-    zone, clock = next(((zone, c) for zone in _CLOCKS if (c := _clock_columns(names, zone))), ("", ()))
+    zone, clock = next(
+        ((zone, c) for zone in NAMES["clocks"] if (c := _clock_columns(names, zone))), ("", ())
+    )
     told = numbers.keys() & {"relative", "absolute", "drone_pitch", "gb_pitch"}
     if not numbers.keys() >= {"latitude", "longitude"} or not told or not ("elapsed" in numbers or clock):
         return None
@@ -224,13 +141,14 @@ def _measured(
 
 def _clock_columns(names: Sequence[tuple[str, str]], zone: str) -> tuple[int, ...]:
     """Return the columns of the date and the time of day in a zone; empty without."""
-    for wanted in _CLOCKS[zone]:
-        if all(name in names for name in wanted):
-            return tuple(names.index(name) for name in wanted)
+    for wanted in NAMES["clocks"][zone]:
+        if all(tuple(name) in names for name in wanted):
+            return tuple(names.index(tuple(name)) for name in wanted)
     return ()
 
 
-def _read(path: Path) -> _Record:
+def _read(path: Path) -> tuple[DjiRows, Bool]:
+    """Read all rows, and in which of them [N] the camera films."""
     refuse_special(path)
     heading = _find_heading(read_head(path))
     if heading is None:
@@ -262,18 +180,42 @@ def _read(path: Path) -> _Record:
     if not clocks:
         raise empty(path, f"holds no rows ({damaged} damaged)")
     blank = np.full(len(clocks), np.nan)
-    names = (*_NUMBERS, *_LENGTHS, "elapsed", "altitude")
+    names = (*NAMES["columns"], *NAMES["lengths"], "elapsed", "altitude")
     columns = {
         name: np.array(values[name]) * heading.numbers[name][1] if name in values else blank for name in names
     }
+    columns["latitude"] = np.where(np.isfinite(columns["longitude"]), columns["latitude"], np.nan)
     notes: list[str] = []
     clock_ns, fine = _parse_clocks(path, clocks, notes)
+    clock = "UTC" if heading.utc else "local time"
     if not clock_ns.any():
+        clock = "the record's start"
         notes.append("shows no date: its times count from the record's start")
     elif not heading.utc:
         notes.append("its clock is local time, taken as UTC")
+    t_ns, timed = _times(clock_ns, columns["elapsed"], fine=fine)
     dropped = {"damaged row": damaged} if damaged else {}
-    return _Record(path, columns, clock_ns, fine, heading.utc, np.array(filming), notes, dropped)
+    rows = DjiRows(t_ns, timed, columns, clock, zero_is_none=True, dropped=dropped, notes=notes)
+    return rows, np.array(filming, np.bool_)
+
+
+def _times(clock_ns: Int64, elapsed_s: Float, *, fine: bool) -> tuple[Int64, Bool]:
+    """Return times [N] in ns, and True where they are known [N]: of a clock of whole seconds in between."""
+    shown = clock_ns != 0
+    if fine or not any_finite(elapsed_s):
+        return clock_ns, shown
+    known = np.asarray(np.abs(np.nan_to_num(elapsed_s, nan=np.inf)) < _LONGEST_S, dtype=np.bool_)
+    since_ns = np.round(np.where(known, elapsed_s, 0) * 1e9).astype(np.int64)
+    both = np.flatnonzero(shown & known)
+    if not len(both):
+        return since_ns, known
+    ahead_ns = clock_ns[both] - since_ns[both]
+    ticks = np.flatnonzero(np.diff(clock_ns[both]) > 0) + 1
+    if len(ticks):  # the clock ticked between a row and the one before
+        ahead_ns = ahead_ns[ticks] + np.diff(since_ns[both])[ticks - 1] // 2
+    else:
+        ahead_ns = ahead_ns + 500_000_000
+    return since_ns + int(np.median(ahead_ns - ahead_ns[0])) + int(ahead_ns[0]), known
 
 
 def _rows(path: Path, heading: _RecordHeading) -> Iterator[list[str]]:

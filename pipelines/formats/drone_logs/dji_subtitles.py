@@ -34,8 +34,10 @@ from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Attitudes, AttitudeTrack, Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
-from pipelines.session.storage import empty, plain_text
+from pipelines.session.storage import empty, own_table, plain_text
 
+NAMES = own_table(__file__, "dji")
+"""Names of columns of flight records and of tags of pictures, by what they hold."""
 # DJI's drones fly no higher than this above their take-off.
 _HIGHEST_M = 500
 
@@ -55,6 +57,7 @@ class DjiRows:
     zero_is_none: bool = False  # angles of a gimbal that are 0 throughout
     level: bool = True  # a missing roll is 0
     dropped: Mapping[str, int] = field(default_factory=dict)
+    notes: Sequence[str] = ()
 
     def angles(self, part: str) -> Float:
         """Return yaw, pitch, roll [N, 3] in degrees of `drone` or `gb`."""
@@ -66,9 +69,7 @@ class DjiRows:
         return np.full_like(found, np.nan) if is_none else found
 
 
-def telemetry_of_rows(
-    path: Path, found: DjiRows, choice: TelemetryChoice, notes: Sequence[str] = ()
-) -> Telemetry:
+def telemetry_of_rows(path: Path, found: DjiRows, choice: TelemetryChoice) -> Telemetry:
     """Build positions and attitudes; a repeated position is replaced by linear interpolation."""
     columns, dropped = found.columns, dict(found.dropped)
     height, which, note_on_height = choose_height(path, columns, choice)
@@ -82,7 +83,7 @@ def telemetry_of_rows(
         height=which,
         unusable={"no time": ~found.timed, "no position": ~np.isfinite(columns["latitude"])},
     )
-    said = [*notes, note_on_height]
+    said = [*found.notes, note_on_height]
     if found.repeats:
         values, moved = between_repeats(track.t_ns, track.values)
         track = replace(track, values=values)
@@ -113,7 +114,8 @@ def attitudes_of_rows(path: Path, found: DjiRows) -> Attitudes:
     if camera is None:
         problem = "holds no gimbal angles"
         raise DataError(path, problem, "name the log and topic that do, or fixed angles", code="no-attitude")
-    return Attitudes(replace(camera, dropped=dropped), found.clock)
+    notes = tuple(f"{path}: {note}" for note in found.notes)
+    return Attitudes(replace(camera, dropped=dropped), found.clock, notes)
 
 
 def choose_height(
@@ -313,17 +315,14 @@ class DjiSrtFormat(DroneLog):
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read positions, interpolated where they are repeated, and angles of body and gimbal."""
-        rows, notes = _rows(read_subtitles(path))
-        return telemetry_of_rows(path, rows, choice, notes)
+        return telemetry_of_rows(path, _rows(read_subtitles(path)), choice)
 
     def read_attitudes(self, path: Path) -> Attitudes:
         """Read the gimbal's angles, also where the drone had no position."""
-        rows, notes = _rows(read_subtitles(path))
-        return replace(attitudes_of_rows(path, rows), notes=(f"{path}: {notes[0]}",))
+        return attitudes_of_rows(path, _rows(read_subtitles(path)))
 
 
-def _rows(subtitles: Subtitles) -> tuple[DjiRows, list[str]]:
-    """Return the rows, and notes of which the first is on the clock."""
+def _rows(subtitles: Subtitles) -> DjiRows:
     columns, notes = _columns(subtitles.texts), [_note_on_clock(subtitles)]
     latitude, longitude = columns["latitude"], columns["longitude"]
     beyond = np.count_nonzero(np.abs(latitude) > 90)
@@ -331,15 +330,15 @@ def _rows(subtitles: Subtitles) -> tuple[DjiRows, list[str]]:
         columns |= {"latitude": longitude, "longitude": latitude}
         notes.append("its latitudes are beyond 90 deg: taken for longitudes, and these for latitudes")
     t_ns, timed = subtitles.times()
-    rows = DjiRows(
+    return DjiRows(
         t_ns,
         timed,
         columns,
         "the drone's clock" if subtitles.has_clock.any() else "the video's start",
         names=("F.PRY", "its gimbal angles"),
         rows="subtitles",
+        notes=notes,
     )
-    return rows, notes
 
 
 def _columns(texts: Sequence[str]) -> dict[str, Float]:

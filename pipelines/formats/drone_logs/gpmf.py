@@ -34,18 +34,7 @@ from pipelines.session.records import Height, Telemetry
 from pipelines.session.registries import TelemetryChoice
 from pipelines.session.storage import damaged
 
-_KINDS = {
-    "b": "i1",
-    "B": "u1",
-    "s": "i2",
-    "S": "u2",
-    "l": "i4",
-    "L": "u4",
-    "j": "i8",
-    "J": "u8",
-    "f": "f4",
-    "d": "f8",
-}
+_KINDS = dict(zip("bBsSlLjJfd", ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"), strict=True))
 # GPMF marks a fix with height by this number.
 _FIX_3D = 3
 # A packet of a second has one time only, so its rows are known to about this.

@@ -13,29 +13,12 @@ from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log
+from pipelines.session.storage import own_table
 
 # Transport and decoding delay a picture by less.
 _MAY_LEAP_NS = 1_000_000_000
 
-_PIXELS: dict[str, tuple[int, str | None]] = {
-    "mono8": (1, "GRAY2BGR"),
-    "8uc1": (1, "GRAY2BGR"),
-    "bgr8": (3, None),
-    "8uc3": (3, None),
-    "rgb8": (3, "RGB2BGR"),
-    "bgra8": (4, "BGRA2BGR"),
-    "rgba8": (4, "RGBA2BGR"),
-    "bayer_rggb8": (1, "BayerRGGB2BGR"),
-    "bayer_bggr8": (1, "BayerBGGR2BGR"),
-    "bayer_gbrg8": (1, "BayerGBRG2BGR"),
-    "bayer_grbg8": (1, "BayerGRBG2BGR"),
-    "yuv422": (2, "YUV2BGR_UYVY"),
-    "uyvy": (2, "YUV2BGR_UYVY"),
-    "yuv422_yuy2": (2, "YUV2BGR_YUY2"),
-    "yuyv": (2, "YUV2BGR_YUY2"),
-}
-"""Bytes of a pixel and the name of OpenCV's conversion (None if none is needed), by encoding."""
-
+_PIXELS = own_table(__file__, "pixels")
 KNOWN = tuple(_PIXELS)
 """Encodings of raw pictures that can be decoded."""
 
@@ -139,6 +122,6 @@ def _raw(sample: PictureSample) -> Picture | None:
         return None
     rows = sample.data[: step * height].reshape(height, step)
     pixels = np.ascontiguousarray(rows[:, : width * pixel]).reshape(height, width, pixel)
-    if conversion is None:
+    if not conversion:
         return pixels
     return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")), np.uint8)

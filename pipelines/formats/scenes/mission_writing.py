@@ -36,15 +36,13 @@ _SLOWEST_MPS = 0.5
 _SETPOINTS_HZ = 10.0
 # DJI drones take off to at least this height.
 _LOWEST_TAKE_OFF_M = 1.2
-# A plan of WPML names a drone, and DJI Pilot asks if another one is connected: this is the Mavic 3E.
-_DJI_DRONE, _DJI_CAMERA = "77", "66"
 # The namespaces of WPML 1.0.2, which the most drones read.
 _KML, _WPML = "http://www.opengis.net/kml/2.2", "http://www.dji.com/wpmz/1.0.2"
 # Zip files cannot hold an earlier date, and any other one would differ from run to run.
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-# The numbers of MAVLink for commands, frames, the autopilot PX4 and a quadrotor.
+# The numbers of MAVLink for commands and for no frame.
 _WAYPOINT, _RETURN, _TAKE_OFF, _SPEED, _GIMBAL = 16, 20, 22, 178, 205
-_NO_FRAME, _PX4, _QUADROTOR = 2, 12, 2
+_NO_FRAME = 2
 # How QGroundControl and MAVLink say that a height counts from home.
 _ABOVE_HOME = {"frame": 3, "AltitudeMode": 1, "AMSLAltAboveTerrain": None}
 # MAVSDK Drone Show counts a row as part of the trajectory by this number.
@@ -214,24 +212,21 @@ def _write_plan(path: Path, flight: _Flight, waypoints: Sequence[_Waypoint]) -> 
         for number, (command, params) in enumerate(_items(waypoints), 1)
     ]
     home, speed = flight.home, max(waypoint.speed_mps for waypoint in waypoints)
-    plan = {
-        "fileType": "Plan",
-        "geoFence": {"circles": [], "polygons": [], "version": 2},
-        "groundStation": "QGroundControl",
-        "mission": {
-            "cruiseSpeed": round(speed, 2),
-            "firmwareType": _PX4,
-            "globalPlanAltitudeMode": 1,
-            "hoverSpeed": round(speed, 2),
-            "items": items,
-            "plannedHomePosition": [home.latitude_deg, home.longitude_deg, home.altitude_m],
-            "vehicleType": _QUADROTOR,
-            "version": 2,
-        },
-        "rallyPoints": {"points": [], "version": 2},
-        "version": 1,
+    plan = _template("plan")
+    plan["mission"] |= {
+        "cruiseSpeed": round(speed, 2),
+        "hoverSpeed": round(speed, 2),
+        "items": items,
+        "plannedHomePosition": [home.latitude_deg, home.longitude_deg, home.altitude_m],
     }
     path.write_text(json.dumps(plan, indent=1) + "\n", encoding="utf-8", newline="\n")
+
+
+def _template(part: str) -> dict[str, Any]:
+    """Return what is the same in all missions: of a plan for PX4, of WPML for a Mavic 3E."""
+    content = (Path(__file__).parent / "data" / "mission.json").read_text(encoding="utf-8")
+    found: dict[str, Any] = json.loads(content)[part]
+    return found
 
 
 def _items(waypoints: Sequence[_Waypoint]) -> Iterator[tuple[int, list[float]]]:
@@ -252,42 +247,17 @@ def _items(waypoints: Sequence[_Waypoint]) -> Iterator[tuple[int, list[float]]]:
 # --- DJI -----------------------------------------------------------------------------------------------
 
 _Values = Mapping[str, Any]
-_GIMBAL_BY_PITCH = {
-    "gimbalHeadingYawBase": "aircraft",
-    "gimbalRotateMode": "absoluteAngle",
-    "gimbalPitchRotateEnable": "1",
-    **{f"gimbal{axis}Rotate{what}": "0" for axis in ("Roll", "Yaw") for what in ("Enable", "Angle")},
-    **dict.fromkeys(("gimbalRotateTimeEnable", "gimbalRotateTime", "payloadPositionIndex"), "0"),
-}
 
 
 def _write_kmz(path: Path, flight: _Flight, waypoints: Sequence[_Waypoint]) -> None:
     speed = f"{max(waypoint.speed_mps for waypoint in waypoints):.2f}"
     lengths = np.linalg.norm(np.diff(flight.ned, axis=0), axis=1)
-    config = {
-        "flyToWaylineMode": "safely",
-        "finishAction": "goHome",
-        "exitOnRCLost": "executeLostAction",
-        "executeRCLostAction": "goBack",
+    config = _template("config") | {
         "takeOffSecurityHeight": f"{max(waypoints[0].height_m, _LOWEST_TAKE_OFF_M):.2f}",
         "globalTransitionalSpeed": speed,
-        "droneInfo": {"droneEnumValue": _DJI_DRONE, "droneSubEnumValue": "0"},
-        "payloadInfo": {"payloadEnumValue": _DJI_CAMERA, "payloadPositionIndex": "0"},
     }
-    template = {
-        "templateType": "waypoint",
-        "templateId": "0",
-        "waylineCoordinateSysParam": {"coordinateMode": "WGS84", "heightMode": "relativeToStartPoint"},
-        "autoFlightSpeed": speed,
-        "gimbalPitchMode": "usePointSetting",
-        "globalWaypointHeadingParam": {"waypointHeadingMode": "smoothTransition"},
-        "globalWaypointTurnMode": "toPointAndPassWithContinuityCurvature",
-        "globalUseStraightLine": "1",
-    }
-    wayline = {
-        "templateId": "0",
-        "executeHeightMode": "relativeToStartPoint",
-        "waylineId": "0",
+    template = _template("template") | {"autoFlightSpeed": speed}
+    wayline = _template("wayline") | {
         "distance": f"{lengths.sum():.2f}",
         "duration": f"{flight.t_s[-1]:.2f}",
         "autoFlightSpeed": speed,
@@ -318,21 +288,15 @@ def _placemark(
         }
     else:
         heights = {"executeHeight": height}
-    actions = {"gimbalRotate": _GIMBAL_BY_PITCH | {"gimbalPitchRotateAngle": pitch}}
+    actions = {"gimbalRotate": _template("gimbal") | {"gimbalPitchRotateAngle": pitch}}
     if waypoint.hold_s > 0.0:
         actions["hover"] = {"hoverTime": f"{waypoint.hold_s:.2f}"}
     return {
         "index": str(index),
         **heights,
         "waypointSpeed": f"{waypoint.speed_mps:.2f}",
-        "waypointHeadingParam": {
-            "waypointHeadingMode": "smoothTransition",
-            "waypointHeadingAngle": f"{waypoint.heading_deg:.1f}",
-            "waypointPoiPoint": "0.000000,0.000000,0.000000",
-            "waypointHeadingAngleEnable": "1",
-            "waypointHeadingPathMode": "followBadArc",
-            "waypointHeadingPoiIndex": "0",
-        },
+        "waypointHeadingParam": _template("heading")
+        | {"waypointHeadingAngle": f"{waypoint.heading_deg:.1f}"},
         "waypointTurnParam": {
             "waypointTurnMode": f"toPointAnd{'Stop' if stops else 'Pass'}WithContinuityCurvature",
             "waypointTurnDampingDist": "0",

@@ -24,7 +24,7 @@ import numpy as np
 
 from pipelines.formats.common.exporting import bodies_of, people_of
 from pipelines.formats.common.files import read_head
-from pipelines.formats.skeletons.joint_files import at_even_times, bone_joints, describe_motion
+from pipelines.formats.skeletons.joint_files import BONE_NAMES, at_even_times, bone_joints, describe_motion
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.poses import conjugate, interpolate_poses, matrix_from_quaternion, multiply, rotate
 from pipelines.geometry.rig import BONE, BONES, PARENT
@@ -408,24 +408,6 @@ def _as_text(values: Float) -> str:
     return " ".join(f"{value:.{_DECIMALS}f}" for value in (np.round(values, _DECIMALS) + 0.0).tolist())
 
 
-_OF_BODY = {
-    "pelvis": "Hips",
-    "spine": "Spine",
-    "back": "Spine1",
-    "chest": "Spine2",
-    "neck": "Neck",
-    "head": "Head",
-    "clavicle": "Shoulder",
-    "upper_arm": "Arm",
-    "forearm": "ForeArm",
-    "hand": "Hand",
-    "thigh": "UpLeg",
-    "shank": "Leg",
-    "foot": "Foot",
-    "toes": "ToeBase",
-}
-
-
 def rig_of_body(body: MovingBody, t_ns: Int64) -> tuple[SkeletalMotion, int]:
     """Take a body, known at one of the times [T], as a rig from its first to its last; count held frames."""
     step_ns = int(np.diff(t_ns).max(initial=0))
@@ -449,7 +431,7 @@ def rig_of_body(body: MovingBody, t_ns: Int64) -> tuple[SkeletalMotion, int]:
     skeletal = SkeletalMotion(
         t_s=(t_ns[span] - t_ns[span][0]) / 1e9,
         bones=tuple(
-            name.removesuffix(kind).rstrip("_").capitalize() + _OF_BODY[kind]
+            name.removesuffix(kind).rstrip("_").capitalize() + BONE_NAMES["of_body"][kind]
             for name, kind in zip(BONES, kinds, strict=True)
         ),
         parent=parent,

@@ -39,7 +39,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.people import SKELETONS, joint_called, points_of_caliscope
 from pipelines.session.progress import Progress
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
-from pipelines.session.storage import damaged, read_text
+from pipelines.session.storage import damaged, own_table, read_text
 
 AXES = ("z-up", "y-up")
 # A hand at 2 m/s moves by 1 mm in this time, so a sample so near keeps its position.
@@ -50,15 +50,7 @@ _LONGEST_STEP = 1.5
 _MOST_FRAMES = 10_000_000
 # More frames for a sample mean stamps that keep no rate.
 _MOST_EMPTY = 100
-_UNITS = {
-    "m": "m",
-    "meters": "m",
-    "metres": "m",
-    "cm": "cm",
-    "centimeters": "cm",
-    "mm": "mm",
-    "millimeters": "mm",
-}
+_UNITS = {"meters": "m", "metres": "m", "centimeters": "cm", "millimeters": "mm"}
 
 
 def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float:
@@ -161,7 +153,8 @@ def describe_motion(motion: JointMotion) -> dict[str, object]:
 
 def metric_unit(stated: str) -> str:
     """Return m, cm or mm for a unit's name in files; any other name as it is."""
-    return _UNITS.get(stated.lower(), stated)
+    unit = _UNITS.get(stated.lower(), stated.lower())
+    return unit if unit in METRES else stated
 
 
 def marker_name(joint: str) -> str:
@@ -191,15 +184,8 @@ def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
 
 
 # Bones that begin at a joint, without side and separators: Biovision's, Acclaim's, Mixamo's, Blender's names.
-_BONES = {
-    "hip": ("upleg", "upperleg", "thigh", "femur"),
-    "knee": ("leg", "lowerleg", "shin", "calf", "tibia"),
-    "ankle": ("foot", "ankle"),
-    "shoulder": ("arm", "upperarm", "humerus"),
-    "elbow": ("forearm", "lowerarm", "radius"),
-    "wrist": ("wrist", "hand"),
-}
-_MIDDLE_BONES = {"hip": ("hips", "pelvis", "root"), "neck": ("neck", "lowerneck")}
+BONE_NAMES = own_table(__file__, "bones")
+"""Names of bones in files of motion."""
 
 
 def bone_joints(bones: tuple[str, ...]) -> tuple[str, ...]:
@@ -210,14 +196,14 @@ def bone_joints(bones: tuple[str, ...]) -> tuple[str, ...]:
     plain = {bone: re.sub(r"[^a-z]", "", bone.rsplit(":", 1)[-1].lower()) for bone in bones}
     named: dict[str, str] = {}
     for side in ("left", "right"):
-        for joint, variants in _BONES.items():
+        for joint, variants in BONE_NAMES["of_a_side"].items():
             for variant in variants:
                 ways = {f"{side}{variant}", f"{side[0]}{variant}", f"{variant}{side[0]}", f"{variant}{side}"}
                 found = next((bone for bone in bones if plain[bone] in ways and bone not in named), None)
                 if found:
                     named[found] = f"{side}_{joint}"
                     break
-    for joint, variants in _MIDDLE_BONES.items():
+    for joint, variants in BONE_NAMES["in_the_middle"].items():
         found = next((bone for variant in variants for bone in bones if plain[bone] == variant), None)
         if found:
             named[found] = joint

@@ -4,15 +4,16 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from pipelines.formats.common.rows import since_epoch_ns
-from pipelines.formats.drone_logs.dji_subtitles import DjiRows, telemetry_of_rows
+from pipelines.formats.drone_logs.dji_subtitles import NAMES, DjiRows, telemetry_of_rows
 from pipelines.formats.drone_logs.telemetry_rows import DroneLog
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.session.errors import DataError
@@ -30,27 +31,11 @@ _SECOND_NS = 1_000_000_000
 _TAG = re.compile(rb"(?<![\w/-])drone(?:-dji)?:(\w+)(?:=\"|>)\s*([^\"<]{1,60})")
 _EXIF, _GPS = 0x8769, 0x8825
 _TAKEN, _OFFSET, _SUBSECOND, _FOCAL_35_MM = 36867, 36881, 37521, 41989
-NAMES = {
-    "latitude": ("GpsLatitude", "Latitude"),
-    "longitude": ("GpsLongitude", "GpsLongtitude", "Longitude"),
-    "relative": ("RelativeAltitude",),
-    "absolute": ("AbsoluteAltitude",),
-    "gb_yaw": ("GimbalYawDegree",),
-    "gb_pitch": ("GimbalPitchDegree",),
-    "gb_roll": ("GimbalRollDegree",),
-    "drone_yaw": ("FlightYawDegree",),
-    "drone_pitch": ("FlightPitchDegree",),
-    "drone_roll": ("FlightRollDegree",),
-    "rtk_flag": ("RtkFlag",),
-    "rtk_std_latitude": ("RtkStdLat",),
-    "rtk_std_longitude": ("RtkStdLon",),
-    "rtk_std_height": ("RtkStdHgt",),
-}
 
 
 @dataclass(frozen=True)
 class Tags:
-    """Tags of one picture; `values` has the columns of `NAMES` that it states."""
+    """Tags of one picture; `values` has the columns of `NAMES["tags"]` that it states."""
 
     t_ns: int | None
     values: Mapping[str, float] = field(default_factory=dict)
@@ -104,7 +89,7 @@ def read_tags(path: Path) -> Tags:
     except (OSError, ValueError, SyntaxError, TypeError, KeyError, Image.DecompressionBombError):
         return Tags(None)
     values = _from_gps(gps)
-    for column, names in NAMES.items():
+    for column, names in NAMES["tags"].items():
         for name in names:
             number = _number(xmp.get(name))
             if number is not None:
@@ -229,7 +214,7 @@ def taken_ns(path: Path) -> tuple[Int64 | None, bool]:
     return (t_ns if t_ns.all() and (np.diff(t_ns) > 0).all() else None), shared
 
 
-class FolderPictures:
+class FolderPictures(AbstractContextManager["FolderPictures"]):
     """Pictures of a folder, by number."""
 
     def __init__(self, path: Path) -> None:
@@ -242,9 +227,6 @@ class FolderPictures:
             remedy = f"name those of one: video: {path.name}/img_{cameras[0]}_*"
             raise DataError(path, problem, remedy, code="ambiguous")
         self._size: tuple[int, ...] | None = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Close nothing: no file stays open."""
@@ -325,15 +307,16 @@ class PictureTags(DroneLog):
             rows="pictures",
             repeats=False,
             level=False,
+            notes=notes,
         )
-        return telemetry_of_rows(path, rows, choice, notes)
+        return telemetry_of_rows(path, rows, choice)
 
 
 def _columns(path: Path) -> tuple[Int64, bool, dict[str, Float]]:
     """Return times and columns of all pictures, and True if some share a second (`picture_times`)."""
     tags = [read_tags(file) for file in FolderPictures(path).files]
     t_ns, shared = picture_times(tags)
-    columns = {name: np.array([each.values.get(name, np.nan) for each in tags]) for name in NAMES}
+    columns = {name: np.array([each.values.get(name, np.nan) for each in tags]) for name in NAMES["tags"]}
     return t_ns, shared, columns | {"altitude": np.full(len(tags), np.nan)}
 
 
