@@ -4,50 +4,25 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory, timestamp_pb2
 
-# A star means a repeated field, a capital a message; the rest are protobuf's own words.
+# By name; without a type `double`. A star means a repeated field, a capital a message.
 _MESSAGES = {
-    "Vector3": {"x": "double", "y": "double", "z": "double"},
-    "Quaternion": {"x": "double", "y": "double", "z": "double", "w": "double"},
-    "Pose": {"position": "Vector3", "orientation": "Quaternion"},
-    "PoseInFrame": {"timestamp": "Timestamp", "frame_id": "string", "pose": "Pose"},
-    "FrameTransform": {
-        "timestamp": "Timestamp",
-        "parent_frame_id": "string",
-        "child_frame_id": "string",
-        "translation": "Vector3",
-        "rotation": "Quaternion",
-    },
-    "FrameTransforms": {"transforms": "FrameTransform*"},
-    "CameraCalibration": {
-        "timestamp": "Timestamp",
-        "width": "fixed32",
-        "height": "fixed32",
-        "distortion_model": "string",
-        "D": "double*",
-        "K": "double*",
-    },
-    "LocationFix": {
-        "timestamp": "Timestamp",
-        "frame_id": "string",
-        "latitude": "double",
-        "longitude": "double",
-        "altitude": "double",
-        "position_covariance": "double*",
-        "position_covariance_type": "fixed32",
-    },
-    "CompressedImage": {"timestamp": "Timestamp", "data": "bytes", "format": "string"},
-    "RawImage": {
-        "timestamp": "Timestamp",
-        "width": "fixed32",
-        "height": "fixed32",
-        "encoding": "string",
-        "step": "fixed32",
-        "data": "bytes",
-    },
+    "Vector3": "x y z",
+    "Quaternion": "x y z w",
+    "Pose": "position:Vector3 orientation:Quaternion",
+    "PoseInFrame": "timestamp:Timestamp frame_id:string pose:Pose",
+    "FrameTransform": "timestamp:Timestamp parent_frame_id:string child_frame_id:string"
+    " translation:Vector3 rotation:Quaternion",
+    "FrameTransforms": "transforms:FrameTransform*",
+    "CameraCalibration": "timestamp:Timestamp width:fixed32 height:fixed32"
+    " distortion_model:string D:double* K:double*",
+    "LocationFix": "timestamp:Timestamp frame_id:string latitude longitude altitude"
+    " position_covariance:double* position_covariance_type:fixed32",
+    "CompressedImage": "timestamp:Timestamp data:bytes format:string",
+    "RawImage": "timestamp:Timestamp width:fixed32 height:fixed32 encoding:string step:fixed32 data:bytes",
 }
 
 
-def _field(number: int, name: str, kind: str) -> dict[str, Any]:
+def _field(number: int, name: str, kind: str = "double") -> dict[str, Any]:
     bare = kind.rstrip("*")
     field: dict[str, Any] = {
         "name": name,
@@ -69,7 +44,7 @@ def _pool() -> descriptor_pool.DescriptorPool:
         "messageType": [
             {
                 "name": name,
-                "field": [_field(k, field, kind) for k, (field, kind) in enumerate(fields.items(), start=1)],
+                "field": [_field(k, *field.split(":")) for k, field in enumerate(fields.split(), start=1)],
             }
             for name, fields in _MESSAGES.items()
         ],

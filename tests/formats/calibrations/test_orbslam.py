@@ -16,33 +16,7 @@ from tests.real_data import real_data
 READER: CalibrationFormat = calibration_files.ORBSLAM
 
 # After Examples/Stereo-Inertial/TUM-VI.yaml and Examples/Stereo/EuRoC.yaml of ORB-SLAM 3, with other numbers.
-FISHEYE = """%YAML:1.0
-File.version: "1.0"
-Camera.type: "KannalaBrandt8"
-Camera1.fx: 190.5
-Camera1.fy: 190.25
-Camera1.cx: 254.5
-Camera1.cy: 256.75
-Camera1.k1: 0.0034
-Camera1.k2: 0.0007
-Camera1.k3: -0.002
-Camera1.k4: 0.0002
-Camera2.fx: 191.5
-Camera2.fy: 191.25
-Camera2.cx: 252.5
-Camera2.cy: 255.25
-Camera2.k1: 0.004
-Camera2.k2: 0.0
-Camera2.k3: 0.0
-Camera2.k4: 0.0
-Camera.width: 512
-Camera.height: 510
-Stereo.T_c1_c2: !!opencv-matrix
-   rows: 1
-   cols: 3
-   dt: f
-   data: [1.0, 0.0, 0.0]
-"""
+FISHEYE = Path(__file__).with_name("orbslam_fisheye.yaml").read_text(encoding="utf-8")
 
 
 def write(folder: Path, text: str) -> Path:

@@ -21,6 +21,8 @@ the mean of the data sets' values, and at a share of the stride where one of the
 samples, is within 1 deg of its extreme.
 """
 
+import tomllib
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -64,58 +66,8 @@ def stance_share(speed: float) -> Band:
     return mean - 0.02, mean + 0.02
 
 
-EVENTS = (
-    Event("strike", "hip", "max", (0.0, 0.0), (19.3, 23.6, 20.1), 5.5),
-    Event(
-        "stance",
-        "hip",
-        "min",
-        (0.3, 0.75),
-        (-10.9, -17.7, -17.0),
-        6.8,
-        ((0.478, 0.565), (0.483, 0.553), (0.464, 0.531)),
-    ),
-    Event(
-        "swing",
-        "hip",
-        "max",
-        (0.65, 0.99),
-        (21.9, 24.4, 25.9),
-        5.5,
-        ((0.828, 0.919), (0.843, 1.0), (0.814, 0.889)),
-    ),
-    Event("strike", "knee", "max", (0.0, 0.0), (4.0, 5.6, 2.5), 5.7),
-    Event(
-        "loading",
-        "knee",
-        "max",
-        (0.02, 0.3),
-        (21.7, 19.3, 16.3),
-        6.3,
-        ((0.112, 0.171), (0.097, 0.166), (0.105, 0.157)),
-    ),
-    Event(
-        "stance",
-        "knee",
-        "min",
-        (0.2, 0.55),
-        (7.7, 6.2, 6.9),
-        5.8,
-        ((0.347, 0.442), (0.360, 0.447), (0.368, 0.430)),
-    ),
-    Event("toe off", "knee", "max", AT_TOE_OFF, (44.0, 30.9, 41.7), 6.5),
-    Event(
-        "swing",
-        "knee",
-        "max",
-        (0.55, 0.95),
-        (64.9, 59.1, 60.3),
-        5.9,
-        ((0.698, 0.741), (0.699, 0.747), (0.686, 0.726)),
-    ),
-    Event("strike", "ankle", "max", (0.0, 0.0), (0.0, -2.1), 5.6),
-    Event("loading", "ankle", "min", (0.0, 0.2), (-4.6, -5.6), 4.5, ((0.037, 0.085), (0.028, 0.073))),
-    Event("stance", "ankle", "max", (0.2, 0.6), (9.6, 11.8), 4.8, ((0.369, 0.481), (0.385, 0.493))),
-    Event("push-off", "ankle", "min", (0.5, 0.8), (-19.8, -19.8), 8.9, ((0.634, 0.672), (0.625, 0.651))),
-    Event("mid swing", "ankle", "max", (0.78, 0.95), (0.7, 2.5), 4.2),
+_ROWS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["events"]
+EVENTS = tuple(
+    Event(name, joint, extreme, tuple(searched), *measured)
+    for name, joint, extreme, searched, *measured in _ROWS
 )

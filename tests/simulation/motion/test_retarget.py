@@ -1,6 +1,8 @@
 """Recorded motion on our bones: known motions under foreign names, scales and rest poses come back."""
 
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,39 +15,12 @@ from tests.simulation.motion.performing import RIG, clearance_m, flat, mound, pe
 
 OURS = ("pelvis", "spine", "back", "chest", "neck", "head")
 SIDED = ("clavicle", "upper_arm", "forearm", "hand", "thigh", "shank", "foot", "toes")
-MAKEHUMAN = ("upperarm01", "lowerarm01", "wrist", "upperleg01", "lowerleg01", "foot")
-NAMES = {  # the trunk upwards, then the bones of a side with * for it; what stands for left and right
-    "mixamo": (
-        ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"],
-        ["*Shoulder", "*Arm", "*ForeArm", "*Hand", "*UpLeg", "*Leg", "*Foot", "*ToeBase"],
-        ("Left", "Right"),
-    ),
-    "biped": (
-        ["Pelvis", "Spine", "Spine1", "Spine2", "Neck", "Head"],
-        ["*_Clavicle", "*_UpperArm", "*_Forearm", "*_Hand", "*_Thigh", "*_Calf", "*_Foot", "*_Toe0"],
-        ("L", "R"),
-    ),
-    "makehuman": (
-        ["root", "spine05", "spine03", "spine01", "neck01", "head"],
-        ["clavicle.*", *(f"{bone}.*" for bone in MAKEHUMAN), "toe1-1.*"],
-        ("L", "R"),
-    ),
-    "joints": (
-        ["Hips", "Chest", "Chest2", "Chest3", "Neck", "Head"],
-        ["*Collar", "*Shoulder", "*Elbow", "*Wrist", "*Hip", "*Knee", "*Ankle", "*Toe"],
-        ("Left", "Right"),
-    ),
-    "letters": (
-        ["hip", "abdomen", "chest", "chest2", "neck", "head"],
-        ["*Collar", "*Shldr", "*ForeArm", "*Hand", "*Thigh", "*Shin", "*Foot", "*Toe"],
-        ("l", "r"),
-    ),
-}
+NAMES = tomllib.loads(Path(__file__).with_name("bones.toml").read_text(encoding="utf-8"))
 PREFIX = {"mixamo": "mixamorig:", "biped": "Bip01_"}
 
 
 def named(style: str) -> tuple[str, ...]:
-    trunk, sided, sides = NAMES[style]
+    trunk, sided, sides = NAMES[style].values()
     names = dict(zip(OURS, trunk, strict=True))
     for side, letter in zip(SIDES, sides, strict=True):
         names |= {
