@@ -36,7 +36,12 @@ from pipelines.keypoints.corrections import (
     swaps_across_views,
     undo_swaps_of_tracks,
 )
-from pipelines.reconstruction.background import clocks_of_backgrounds, refine_cameras, turned_aside
+from pipelines.reconstruction.background import (
+    clocks_of_backgrounds,
+    refine_cameras,
+    turned_aside,
+    with_known_mount,
+)
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
 from pipelines.reconstruction.bodies import (
     bodies_of_one_camera,
@@ -66,6 +71,7 @@ from pipelines.reconstruction.loading import (
     load_clock_sigma,
     load_pose_errors,
     load_truth,
+    shared_position_variance,
     source_of_pose_noise,
     with_reference,
 )
@@ -139,7 +145,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=55)
+RECONSTRUCT = Stage("reconstruct", revision=56)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -603,8 +609,10 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss
             solve = solver_for("robust", cameras, observations)
             result = refused_people(solve(views), observations, seen.anybody)
-    if binding is not None:
-        result = replace(result, covariance=result.covariance + binding.common)
+    common = shared_position_variance(flight.errors(logged)) * np.eye(3)
+    common += 0.0 if binding is None else binding.common
+    if common.any():
+        result = replace(result, covariance=result.covariance + common)
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
     )
@@ -613,6 +621,9 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     truth = None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns)
     names = [camera.name for camera in cameras]
     method = settings.method if made.bodies is None else "auto"
+    if method != settings.method:
+        why = "one camera measures no depth, so a body was fitted as by auto"
+        warnings.append(f"method {settings.method} was not used: {why}")
     metrics = assess(observations, views, result, cameras=names, method=method, truth=truth, solve=solve)
     people = _people_seen(description, names, seen.association, doubted)
     unseen = [description.names_of_people(k + 1)[k] for k in seen.association.unseen]
@@ -650,7 +661,6 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
             *seen.association.reasons,
             *(f"nobody is seen near the log of {name}" for name in unseen),
             *people_warnings(people),
-            *_unused_method(settings.method, made),
             *(
                 f"{name}: {counts['without_motion']} keypoints stand at the picture's time instead of their"
                 " row's: no neighbouring picture shows the person"
@@ -709,6 +719,7 @@ def clocks_of(
 
     A camera that turns has its clock from its background. The others are compared with these by the rays of
     people, or with each other. An offset that all cameras share is estimated from all backgrounds together.
+    Rays of cameras whose mounts nobody knows meet by chance, so backgrounds turn their logs first.
     Return the clocks (None where all are held), their prior standard deviations [C], s, and what was
     triangulated if all were held.
     """
@@ -718,8 +729,13 @@ def clocks_of(
     exact = (prior_s == 0) & (settings.method == "auto")
     questioned_s = np.where(exact, QUESTIONED_SIGMA_S, prior_s)
     if flight.followed and questioned_s.any():
+        followed, errors, between = flight.followed, flight.errors(cameras), flight.between
+        cameras = [
+            with_known_mount(camera, followed[camera.name], of, between)
+            for camera, of in zip(cameras, errors, strict=True)
+        ]
         offset_s, sigma_s = clocks_of_backgrounds(
-            cameras, flight.followed, flight.errors(cameras), questioned_s, exact, between=flight.between
+            cameras, followed, errors, questioned_s, exact, between=between
         )
         wrong = exact & is_wrong(np.nan_to_num(offset_s), np.nan_to_num(sigma_s))
         held = exact & ~wrong
@@ -793,13 +809,6 @@ def _doubted(made: _Triangulated) -> list[str]:
     """Say of each person why they must not determine cameras and clocks; "" for those who do."""
     seen = made.seen
     return doubted_people(seen.observations, made.views, made.result, seen.association.doubts)
-
-
-def _unused_method(method: str, made: _Triangulated) -> list[str]:
-    """Say that a single camera is not triangulated, if somebody asked for that."""
-    if made.bodies is None or method == "auto":
-        return []
-    return [f"method {method} was not used: one camera measures no depth, so a body was fitted as by auto"]
 
 
 def _robust_flight(

@@ -209,10 +209,6 @@ class PosePrior:
         constant = np.square([np.hypot(self.constant[0], self.constant[2]), self.constant[1]])
         return np.sqrt(np.square(self.white) + constant + slow)
 
-    def covariance(self, times: int) -> Float:
-        """Return the covariance [times, 6, 6] of the logged poses."""
-        return np.tile(np.diag(np.repeat(self.level**2, 3)), (times, 1, 1))
-
 
 def _unknown(number: int, rate: float) -> Process:
     """Build the stationary process of slow errors that nobody stated, from their rate (per root of s)."""
@@ -239,7 +235,7 @@ class Adjusted:
 
     position: Float  # [T, 3] m
     rotation: Float  # [T, 3, 3] world_from_camera
-    covariance: Float  # [T, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2)
+    covariance: Float  # [T, 6, 6] position in the world (m^2), rotation vector in the camera (rad^2), or NaN
     left: PoseErrors | None  # errors that remain; None where refused
     modes: Float  # [T, 6, R] of the errors that remain (`ErrorModes`), but for a constant shift
     shift_m: float  # standard deviation of that shift
@@ -296,15 +292,15 @@ def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior)
 def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
     posed = np.flatnonzero(np.isfinite(position[:, 0]))
 
-    def refused(reason: str, reprojection_px: float = np.nan) -> Adjusted:
-        stays = prior.covariance(len(position))
+    errors, covariance = np.zeros((len(position), 6)), np.full((len(position), 6, 6), np.nan)
+
+    def refused(reason: str, px: float = np.nan) -> Adjusted:
         modes, (shift_m, *_), turn = np.empty((len(position), 6, 0)), prior.constant, np.zeros(3)
-        px = reprojection_px
-        return Adjusted(position, rotation, stays, None, modes, shift_m, turn, prior, 0, px, reason)
+        unknown = np.full_like(covariance, np.nan)
+        return Adjusted(position, rotation, unknown, None, modes, shift_m, turn, prior, 0, px, reason)
 
     if not len(posed):
         return refused("none of its pictures has a pose")
-    errors, covariance = np.zeros((len(position), 6)), prior.covariance(len(position))
     covariance[posed] = 0.0
     unbound, points, results = 0, 0, []
     parts = np.array_split(posed, -(-len(posed) // STRETCH))
@@ -1076,6 +1072,21 @@ def refine_cameras(
             reason = entries[camera.name]["reason"]
             warnings.append(f"{camera.name}: its logged poses stay, because {reason}")
     return refined, entries, warnings
+
+
+def with_known_mount(
+    camera: Camera, followed: Followed | str, stated: PoseErrors | None, between: Interpolation
+) -> Camera:
+    """Take a constant rotation error that may be large out of a log, as far as the background shows it.
+
+    Attitudes still change as logged, so that the log can be read at other times than those of its pictures.
+    """
+    prior, log = PosePrior.of(stated), camera.trajectory
+    if isinstance(followed, str) or prior.constant[1] <= _FAR_RAD:
+        return camera
+    at = camera.poses_at(camera.frame_t_ns[followed.rows], between)
+    back = quaternion_from_rotation_vector(-adjust(background_of(camera, followed), *at, prior).turn)
+    return replace(camera, trajectory=replace(log, quaternion_xyzw=multiply(log.quaternion_xyzw, back)))
 
 
 def turned_aside(camera: Camera, followed: Followed, between: Interpolation) -> tuple[float, float] | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.noise import (
+    ROTATION,
     UNKNOWN_SIGMA,
     NoiseModel,
     PoseErrors,
@@ -43,6 +44,11 @@ from pipelines.session.tables import (
 
 # More people in one picture are errors of the detector, and memory grows with their number.
 _MOST_PEOPLE = 12
+# Satellite positions decorrelate in minutes, those of odometry and of other logs are stated with seconds.
+MIN_SATELLITE_CORRELATION_S = 60.0
+# Receivers side by side share the errors of orbits, clocks and the air, not those of reflections and noise.
+# How much that is differs with receivers; half of the variance is assumed.
+SHARED_BY_RECEIVERS = 0.5
 
 Calibrated = Callable[[Float, NDArray[np.str_]], Float]
 
@@ -188,6 +194,22 @@ def _prior_of(models: Sequence[NoiseModel], camera: Camera) -> PoseErrors:
     except ValueError:
         level = np.array(UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
         return errors_of_level(level)
+
+
+def shared_position_variance(errors: Sequence[PoseErrors | None]) -> float:
+    """Compute the variance, m^2 per axis, that all cameras' positions share beside the mean of their errors.
+
+    Estimates take errors of cameras for independent, and no picture shows a shift of all of them.
+    """
+    lasting = [
+        sum(
+            each.sigma0**2
+            for each in (of.processes if of else ())
+            if each.number != ROTATION and MIN_SATELLITE_CORRELATION_S <= each.correlation_s < np.inf
+        )
+        for of in errors
+    ]
+    return SHARED_BY_RECEIVERS * min(lasting) * (1 - 1 / len(lasting))
 
 
 def source_of_pose_noise(

@@ -402,10 +402,8 @@ def _with_sightings(
     key: Sequence[int], at: Float, turned: Float, names: Any, features: Sequence[KeyFeatures], ratio: float
 ) -> PictureMap:
     """Return a map of pictures with their points that are seen often; `names` has one for each, or -1."""
-    often = (
-        np.bincount(np.concatenate([names[number][names[number] >= 0] for number in key])) >= MIN_SIGHTINGS
-    )
-    seen = [(names[number] >= 0) & often[names[number]] for number in key]
+    counts = np.bincount(np.concatenate([names[number][names[number] >= 0] for number in key]))
+    seen = [(names[number] >= 0) & (counts[names[number]] >= MIN_SIGHTINGS) for number in key]
     points = np.concatenate([names[number][each] for number, each in zip(key, seen, strict=True)])
     return PictureMap(
         np.array(key, np.int64),
@@ -766,17 +764,12 @@ class _Bundle:
         """Return the normal equations of poses [6 K, 6 K], [6 K], points [P, 3, 3], [P, 3], and both."""
         from scipy.sparse import bsr_matrix
 
-        picture, point, count, focal_px = (
-            self.found.seen_in,
-            self.found.seen_point,
-            len(at),
-            self.focal_px,
-        )
+        picture, point, count = self.found.seen_in, self.found.seen_point, len(at)
         off, seen = self.residuals(at, turn, points)
         weight = 1 / (1 + np.square(off / self.loss_px).sum(axis=1)) / (SIGHTINGS_ALIKE * self.sigma_px**2)
         project = np.zeros((len(off), 2, 3))
-        project[:, 0, 0] = project[:, 1, 1] = focal_px / seen[:, 2]
-        project[:, :, 2] = -focal_px * seen[:, :2] / np.square(seen[:, 2:])
+        project[:, 0, 0] = project[:, 1, 1] = self.focal_px / seen[:, 2]
+        project[:, :, 2] = -self.focal_px * seen[:, :2] / np.square(seen[:, 2:])
         of_point = project @ np.swapaxes(turn[picture], 1, 2)
         of_turn = of_point @ cross_matrix(points[point] - at[picture])
         of_pose = np.concatenate([-of_point, of_turn], axis=2)

@@ -114,7 +114,7 @@ class RobustFlight:
     measured: bool  # the prior was measured, and not only stated
     clock_sigma_s: Float  # [C] prior standard deviation of each clock offset, 0 for a known clock
     between: Interpolation  # rules for interpolating between logged poses
-    workers: int  # see `refine_in_windows`
+    workers: int  # see `_refine_in_windows`
     executor: Executor | None  # works on the windows instead
     trusted: Bool  # [P] people who determine cameras and clocks; the others are triangulated afterwards
     stature_m: float | None = None  # of the people, as stated
@@ -345,19 +345,17 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Float) 
     sightings = [_sighting(flight, c, camera) for c, camera in enumerate(cameras)]
     if flight.waiting is not None:
         flight.waiting.release()
-    return refine_in_windows(
+    order = _Order(
         flight.t_s,
         sightings,
         start.reshape(-1, people * joints, 3),
         rigid_pairs(flight.observations.joints, people),
         flight.prior,
         flight.clock_sigma_s,
-        windows=flight.windows,
-        measured=flight.measured,
-        size=usual_size(flight.observations.joints, people, flight.stature_m),
-        workers=flight.workers,
-        executor=flight.executor,
+        flight.measured,
+        usual_size(flight.observations.joints, people, flight.stature_m),
     )
+    return _refine_in_windows(order, flight.windows, flight.workers, flight.executor)
 
 
 def _start_with_offsets(flight: RobustFlight, offset_s: Float) -> Float:
@@ -414,19 +412,19 @@ def _observe_refined(refined: Refined, flight: RobustFlight, offset_s: Float) ->
     observed, views = (
         _observe_with_offsets(flight, offset_s) if offset_s.any() else (flight.observations, flight.views)
     )
-    position, rotation = observed.position.copy(), observed.rotation.copy()
-    for c in range(len(flight.cameras)):
-        numbers = _numbers_at(refined.corrections[c], flight.t_s - refined.clock_offset_s[c])
+    views = replace(views, pixel_sigma=np.full(len(flight.cameras), PIXEL_SIGMA_PX))
+    views = _with_corrected_poses(views, refined, flight.t_s)
+    return replace(observed, position=views.position, rotation=views.rotation), views
+
+
+def _with_corrected_poses(views: Views, refined: Refined, t_s: Float) -> Views:
+    """Correct the poses [T] of views, which count as exact then, and estimate the noise of pixels."""
+    position, rotation = views.position.copy(), views.rotation.copy()
+    for c, correction in enumerate(refined.corrections):
+        numbers = _numbers_at(correction, t_s - refined.clock_offset_s[c])
         position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], numbers)
-    views = replace(
-        views,
-        position=position,
-        rotation=rotation,
-        pixel_sigma=np.full(len(flight.cameras), PIXEL_SIGMA_PX),
-        pose_sigma=np.zeros_like(views.pose_sigma),
-    )
-    views = replace(views, pixel_sigma=estimate_noise(views))
-    return replace(observed, position=position, rotation=rotation), views
+    views = replace(views, position=position, rotation=rotation, pose_sigma=np.zeros_like(views.pose_sigma))
+    return replace(views, pixel_sigma=estimate_noise(views))
 
 
 def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
@@ -550,10 +548,10 @@ class _Order:
     """Arguments of `refine`."""
 
     t_s: Float
-    sightings: tuple[Sighting, ...]
+    sightings: Sequence[Sighting]
     start: Float
     bones: Int64
-    prior: list[PoseErrors] | None
+    prior: Sequence[PoseErrors] | None
     clock_sigma_s: Float
     measured: bool
     size: UsualSize | None
@@ -567,30 +565,17 @@ class _Order:
         return replace(
             self,
             t_s=t_s,
-            sightings=tuple(_within(sighting, *around) for sighting in self.sightings),
+            sightings=[_within(sighting, *around) for sighting in self.sightings],
             start=self.start[own],
             prior=None if self.prior is None else [errors.later(later_s) for errors in self.prior],
         )
 
 
-def refine_in_windows(
-    t_s: Float,
-    sightings: Sequence[Sighting],
-    start: Float,
-    bones: Int64,
-    prior: Sequence[PoseErrors] | None,
-    clock_sigma_s: Float,
-    *,
-    windows: Sequence[FlightWindow],
-    measured: bool = False,
-    size: UsualSize | None = None,
-    workers: int = 1,
-    executor: Executor | None = None,
+def _refine_in_windows(
+    whole: _Order, windows: Sequence[FlightWindow], workers: int, executor: Executor | None
 ) -> Refined:
     """Run `refine` on some windows, and join the results: medians of clocks, NaN joints where none is."""
-    levels = None if prior is None else list(prior)
-    whole = _Order(t_s, tuple(sightings), start, bones, levels, clock_sigma_s, measured, size)
-    if len(windows) == 1 and windows[0].stop - windows[0].first == len(t_s):
+    if len(windows) == 1 and windows[0].stop - windows[0].first == len(whole.t_s):
         return _refine(whole)
     if executor is None:
         memory = available_bytes()
@@ -600,21 +585,12 @@ def refine_in_windows(
     parts: list[Refined | None] = [None] * len(windows)
     for number, found in each_part(_refine, orders, workers=workers, executor=executor):
         joined.add(windows[number], found)
-        parts[number] = replace(found, position=start[:0], covariance=start[:0], corrections=())
+        parts[number] = replace(found, position=whole.start[:0], covariance=whole.start[:0], corrections=())
     return joined.refined([part for part in parts if part is not None])
 
 
 def _refine(order: _Order) -> Refined:
-    return refine(
-        order.t_s,
-        order.sightings,
-        order.start,
-        order.bones,
-        order.prior,
-        order.clock_sigma_s,
-        measured=order.measured,
-        size=order.size,
-    )
+    return refine(**vars(order))
 
 
 class _Joined:
@@ -765,12 +741,7 @@ def refined_points(
     )
     if found.fallback is not None:
         return noisy, start, found.fallback
-    position, rotation = views.position.copy(), views.rotation.copy()
-    for c, correction in enumerate(found.corrections):
-        numbers = _numbers_at(correction, t_s)
-        position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], numbers)
-    moved = replace(views, position=position, rotation=rotation, pose_sigma=np.zeros_like(views.pose_sigma))
-    moved = replace(moved, pixel_sigma=estimate_noise(moved))
+    moved = _with_corrected_poses(views, found, t_s)
     gated = triangulate(moved, method="robust")
     refined = found.position.reshape(-1, 3)
     ok = (gated.status == STATUS.index("ok")) & np.isfinite(refined[:, 0])

@@ -56,14 +56,8 @@ def attitude_error_deg(session: Path, folder: Path, camera: str) -> float:
     """Return the RMS angle between the attitudes of pictures in a session and the truth, deg."""
     poses = read_poses(session / "cameras" / camera / "poses.parquet")
     true = TUM.read_trajectory(folder / "truth" / f"{camera}.tum")
-    there = interpolate_poses(
-        true.t_ns,
-        true.position,
-        true.quaternion_xyzw,
-        poses.t_ns,
-        max_gap_ns=10**9,
-        max_extrapolation_ns=10**8,
-    )[1]
+    logged = true.t_ns, true.position, true.quaternion_xyzw
+    there = interpolate_poses(*logged, poses.t_ns, max_gap_ns=10**9, max_extrapolation_ns=10**8)[1]
     off = rotation_vector_from_quaternion(multiply(conjugate(there), poses.quaternion_xyzw))
     return float(np.degrees(np.sqrt(np.square(off).sum(axis=1).mean())))
 

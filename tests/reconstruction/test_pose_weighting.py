@@ -8,9 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.noise import ROTATION, PoseErrors, errors_of_level
+from pipelines.geometry.noise import ROTATION, GaussMarkov, PoseErrors, errors_of_level, pose_errors
 from pipelines.geometry.poses import quaternion_from_rotation_vector
 from pipelines.geometry.triangulation import STATUS, estimate_noise, triangulate
+from pipelines.reconstruction.loading import shared_position_variance
 from pipelines.reconstruction.log_stretches import MOST_SIGMA, mend
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from pipelines.reconstruction.solving import triangulate_widened
@@ -52,6 +53,17 @@ def test_a_level_alone_becomes_half_new_and_half_lasting_errors() -> None:
         assert process.constant
         found[1 if process.number == ROTATION else 0] += process.sigma0**2
     np.testing.assert_allclose(np.sqrt(found), [0.3, 0.02])
+
+
+def test_receivers_share_half_of_their_variance() -> None:
+    """The mean of C errors with variance v, each pair of which has v / 2 in common, has v (1 + 1 / C) / 2."""
+    satellites, other = (
+        pose_errors([GaussMarkov(position_m=1.5, rotation_deg=1.0, correlation_s=s)]) for s in (100.0, 10.0)
+    )
+    for count in (1, 2, 5):
+        mean = 1.5**2 / count + shared_position_variance([satellites] * count)
+        assert mean == pytest.approx(1.5**2 * (1 + 1 / count) / 2)
+    assert not any(shared_position_variance([satellites, beside]) for beside in (other, None))
 
 
 SECONDS, RATE_HZ = 8.0, 50
