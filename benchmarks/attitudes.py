@@ -34,7 +34,7 @@ from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
 from benchmarks.corpus.stored import Flight, flights, read_backgrounds, read_keypoints
 from benchmarks.results import markdown_table, parser_of, show
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.noise import NoiseModel, disturb, pose_errors
+from pipelines.geometry.noise import disturb, pose_errors
 from pipelines.geometry.poses import (
     conjugate,
     cross_matrix,
@@ -61,7 +61,8 @@ from pipelines.reconstruction.picture_map import (
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
-from pipelines.session.records import Detections, Trajectory
+from pipelines.session.records import Trajectory
+from pipelines.session.tables import detections_from
 from pipelines.simulation.flight import SimulatedDrone
 from pipelines.simulation.flight_files import write_tum
 from pipelines.sources.attitudes import FilmOfCamera, UnposedCamera, posed_by_people, turned_by_pictures
@@ -128,20 +129,20 @@ def measured(name: str, draws: int) -> Iterator[list[str]]:
         except NoAttitudesError:
             yield [*row, "not mapped", *4 * ["-"]]
             continue
-        logs = [(noise_models("LOGS", noise), step_s) for noise, step_s in LOGS.values()]
-        figures = [_figures(found, drone, *log, draws) for log in logs]
+        figures = [_figures(found, drone, *log, draws) for log in LOGS.values()]
         row.append(f"{sum(refused for refused, *_ in figures)}/{len(figures) * draws}")
         yield row + [text for _, *texts in figures for text in texts]
 
 
 def _figures(
-    found: PictureMap, drone: SimulatedDrone, models: list[NoiseModel], step_s: float, draws: int
+    found: PictureMap, drone: SimulatedDrone, noise: Noise, step_s: float, draws: int
 ) -> tuple[int, str, str]:
     """Lay a map on places with errors drawn anew; return refusals, errors with their bound, and NEES."""
     t_ns, position = drone.at_frames.t_ns, drone.at_frames.camera_position
     own = t_ns, position, drone.at_frames.camera_quaternion_xyzw
     key_t_ns = t_ns[key_rows(t_ns)]
-    at_ns, errors = key_t_ns[found.key], pose_errors(models)
+    at_ns, models = key_t_ns[found.key], noise_models("LOGS", noise)
+    errors = pose_errors(models)
     true = interpolate_poses(*own, at_ns, max_gap_ns=10**9, max_extrapolation_ns=10**9)[1]
     step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)
     off, nees = [], []
@@ -172,39 +173,13 @@ def _bound_rad(places: Float, turn: Float, covariance: Float) -> float:
 
 def used(names: Sequence[str], log: str, draws: int) -> list[str]:
     """Measure joints with attitudes by pictures (or far off), and with logged ones on the same places."""
-    (place_log, far), found = USED[log], []
-    noise, step_s = LOGS[place_log]
-    models, usual, off = (noise_models("LOGS", each or TURNED) for each in (noise, TURNED, far))
-    turn = partial(turned_by_pictures, log, pose_noise=noise, note=lambda _: None, progress=Silent())
+    found = []
     for draw in range(draws):
-        (flight,) = [each for each in flights() if each.name == names[draw % len(names)]]
-        backgrounds, logged, other = read_backgrounds(flight), {}, {}
-        with TemporaryDirectory() as folder, suppress(DataError):
-            drawn = DrawnFlight(flight, Path(folder) / "shared")
-            drawn.write_shared()
-            for number, drone in enumerate(drawn.simulated.drones):
-                t_ns, true = drone.at_frames.t_ns, drone.at_frames.camera_position
-                poses, name = (t_ns, true, drone.at_frames.camera_quaternion_xyzw), drone.name
-                seeds = [5, draw, number], [5, draw]  # receivers share half of the variance
-                errors = [disturb(models, *poses, np.random.default_rng(seed))[0] - true for seed in seeds]
-                step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)
-                rows = np.append(np.arange(0, len(t_ns) - 1, step), len(t_ns) - 1)
-                places = (true + np.sqrt(0.5) * (errors[0] + errors[1]))[rows]
-                between = np.stack([np.interp(t_ns, t_ns[rows], axis) for axis in places.T], axis=1)
-                seed = [6, draw, number]
-                turned, away = (
-                    disturb(each, *poses, np.random.default_rng(seed))[1] for each in (usual, off)
-                )
-                logged[name] = Trajectory(t_ns, between, turned), _both(noise, TURNED)
-                other[name] = Trajectory(t_ns, between, away), _both(noise, far or TURNED)
-                if far is None:
-                    track = Trajectory(t_ns[rows], places, np.full((len(rows), 4), np.nan))
-                    film = NO_FILM, CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), drone.intrinsics
-                    kept = partial(_map_of, drone, backgrounds[name].tracks)
-                    by = turn(name, *film, track, refine_focal=False, satellite_sigma_m=None, kept=kept)
-                    other[name] = by.trajectory, by.pose_noise
-            sessions = [_session_of(drawn, Path(folder) / str(k), of) for k, of in enumerate((logged, other))]
-            found.append([_outcome(flight, session) for session in sessions])
+        name = names[draw % len(names)]
+        try:
+            found.append(_used_once(name, log, draw))
+        except DataError as error:
+            print(f"{name}, draw {draw}: refused: {error}")
     if not found:
         return [log, f"0/{draws}", *4 * ["-"]]
     (first, nees), (second, others) = np.mean(found, axis=0)
@@ -213,8 +188,40 @@ def used(names: Sequence[str], log: str, draws: int) -> list[str]:
     return [log, f"{len(found)}/{draws}", *row, f"{nees:.1f}, {others:.1f}"]
 
 
-def _both(places: Noise, turns: Noise) -> Noise:
-    return {model: places.get(model, {}) | turns.get(model, {}) for model in places | turns}
+def _used_once(name: str, log: str, draw: int) -> list[tuple[float, float]]:
+    logged: dict[str, tuple[Trajectory, Noise]] = {}
+    (place_log, far), other = USED[log], logged.copy()
+    noise, step_s = LOGS[place_log]
+    models = noise_models("LOGS", noise)
+    turn = partial(turned_by_pictures, log, pose_noise=noise, note=lambda _: None, progress=Silent())
+    (flight,) = [each for each in flights() if each.name == name]
+    backgrounds = read_backgrounds(flight)
+    with TemporaryDirectory() as folder:
+        drawn = DrawnFlight(flight, Path(folder) / "shared")
+        drawn.write_shared()
+        for number, drone in enumerate(drawn.simulated.drones):
+            t_ns, true, camera = drone.at_frames.t_ns, drone.at_frames.camera_position, drone.name
+            poses = t_ns, true, drone.at_frames.camera_quaternion_xyzw
+            # Receivers share half of the variance. To a seed, a 0 at its end is nothing.
+            seeds = [5, draw, 1 + number], [5, draw]
+            errors = [disturb(models, *poses, np.random.default_rng(seed))[0] - true for seed in seeds]
+            step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)
+            rows = np.append(np.arange(0, len(t_ns) - 1, step), len(t_ns) - 1)
+            places = (true + np.sqrt(0.5) * (errors[0] + errors[1]))[rows]
+            between = np.stack([np.interp(t_ns, t_ns[rows], axis) for axis in places.T], axis=1)
+            for of, turned in ((logged, TURNED), (other, far or TURNED)):
+                both = {model: noise.get(model, {}) | turned.get(model, {}) for model in noise | turned}
+                seeded = np.random.default_rng([6, draw, number])
+                away = disturb(noise_models("LOGS", turned), *poses, seeded)[1]
+                of[camera] = Trajectory(t_ns, between, away), both
+            if far is None:
+                track = Trajectory(t_ns[rows], places, np.full((len(rows), 4), np.nan))
+                film = NO_FILM, CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), drone.intrinsics
+                kept = partial(_map_of, drone, backgrounds[camera].tracks)
+                by = turn(camera, *film, track, refine_focal=False, satellite_sigma_m=None, kept=kept)
+                other[camera] = by.trajectory, by.pose_noise
+        sessions = [_session_of(drawn, Path(folder) / str(k), of) for k, of in enumerate((logged, other))]
+        return [_outcome(flight, session) for session in sessions]
 
 
 def _session_of(drawn: DrawnFlight, place: Path, tracks: Mapping[str, tuple[Trajectory, Noise]]) -> Path:
@@ -249,7 +256,7 @@ def joined(name: str) -> list[str]:
         drawn = DrawnFlight(flight, Path(folder) / "shared")
         cameras = {}
         for drone in drawn.simulated.drones:
-            t_ns, people = drone.at_frames.t_ns, _detections(kept.tables[drone.name])
+            t_ns, people = drone.at_frames.t_ns, detections_from(kept.tables[drone.name], JOINED)
             film = NO_FILM, CameraFrames(np.arange(len(t_ns)), t_ns, t_ns), drone.intrinsics
             map_of = partial(_map_of, drone, backgrounds[drone.name].tracks)
             cameras[drone.name] = UnposedCamera(*film, people, False, map_of)
@@ -278,14 +285,6 @@ def joined(name: str) -> list[str]:
         errors = ", ".join(f"{_outcome(flight, each)[0]:.0f}" for each in sessions)
         row = [name, f"{np.sqrt(np.square(off).mean()):.2f}", f"{np.mean(nees):.1f}"]
         return [*row, f"{100 / to_true.scale - 100:+.1f}", errors]
-
-
-def _detections(table: pd.DataFrame) -> Detections:
-    """Return kept keypoints as a file's."""
-    wide = table.pivot_table(index=["frame", "person"], columns="joint", values=["x", "y", "confidence"])
-    x, y, sure = (wide[part][list(JOINED)].to_numpy() for part in ("x", "y", "confidence"))
-    frame, person = (wide.index.get_level_values(k).to_numpy() for k in (0, 1))
-    return Detections(JOINED, frame, person, np.stack([x, y], axis=-1), np.nan_to_num(sure), np.unique(frame))
 
 
 def _map_of(drone: SimulatedDrone, seen: pd.DataFrame, _: str = "") -> PictureMap:
