@@ -279,10 +279,6 @@ class _FlightReader(AbstractContextManager["_FlightReader"]):
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
         self.check_sources()
 
-    def _pose_axes(self, camera: CameraSources) -> Axes:
-        pose = camera.pose
-        return pose.axes or self._logs.settings(pose.file).axes or self._flight.world.frame
-
     def _gimbal_axes(self, camera: CameraSources) -> Axes:
         gimbal = camera.gimbal
         if gimbal is None:
@@ -320,7 +316,8 @@ class _FlightReader(AbstractContextManager["_FlightReader"]):
             detections, repeats = without_repeats(detections, frames)
             for repeat in repeats:
                 self._take_note(f"{name} {repeat}: they are left out")
-        logged = self._files.is_log("pose", camera.pose)
+        pose, logged = camera.pose, self._files.is_log("pose", camera.pose)
+        axes = pose.axes or self._logs.settings(pose.file).axes or self._flight.world.frame
         return CameraData(
             detections,
             detector_format,
@@ -332,8 +329,8 @@ class _FlightReader(AbstractContextManager["_FlightReader"]):
             still=self.poses.is_still(camera),
             notes=self.take_notes(),
             pose_noise=pose_noise,
-            stamps=self._logs.settings(camera.pose.file).stamps if logged else None,
-            axes=(self._pose_axes(camera), self._gimbal_axes(camera)),
+            stamps=self._logs.settings(pose.file).stamps if logged else None,
+            axes=(axes, self._gimbal_axes(camera)),
             picture_map=picture_map,
         )
 

@@ -123,17 +123,14 @@ def camera_names(labels: Sequence[Label]) -> list[str]:
         distinct = [tuple(word for word in label if word.key not in common) for label in labels]
         labels = distinct if all(distinct) else labels
         longest = max(len(label) for label in labels)
-        enough = (k for k in range(1, longest) if len({_keys(label[:k]) for label in labels}) == len(labels))
+        keys = [tuple(word.key for word in label) for label in labels]
+        enough = (k for k in range(1, longest) if len({key[:k] for key in keys}) == len(labels))
         length = next(enough, longest)
         labels = [label[:length] for label in labels]
     names: list[str] = []
     for label in labels:
         names.append(unique(fitting("_".join(word.text for word in label), f"camera{len(names) + 1}"), names))
     return names
-
-
-def _keys(label: Label) -> tuple[tuple[str, int | None], ...]:
-    return tuple(word.key for word in label)
 
 
 def fitting(text: str, otherwise: str) -> str:

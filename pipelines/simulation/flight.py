@@ -120,7 +120,8 @@ def build_set(scenario: Scenario, *, bvh: Mapping[str, SkeletalMotion] | None = 
     people = []
     for index, (name, look) in enumerate(scenario.people.items()):
         person = make_body(look.body)
-        moving = _moving(look, person, scenario, (bvh or {}).get(name), _motion_seed(scenario.seed, index))
+        seed = int(np.random.default_rng([scenario.seed, _MOTION, index]).integers(2**32))
+        moving = _moving(look, person, scenario, (bvh or {}).get(name), seed if index else scenario.seed)
         people.append(Performer(name, look, person, moving))
     way_s = np.arange(*_span_s(scenario), _WAY_S)
     ways = np.concatenate([each.moving(way_s).root[:, :2] for each in people])
@@ -263,12 +264,6 @@ def _span_s(scenario: Scenario) -> tuple[float, float]:
 def _of_others(person: int) -> list[int]:
     """Return the part of a random seed that is a person's own; the first has the numbers of an only one."""
     return [person] if person else []
-
-
-def _motion_seed(seed: int, person: int) -> int:
-    if not person:
-        return seed
-    return int(np.random.default_rng([seed, _MOTION, person]).integers(2**32))
 
 
 def _estimated(each: Performer, index: int, scenario: Scenario, t_s: Float) -> tuple[Int64, Float]:

@@ -265,7 +265,8 @@ def pelvis_height(
     """
     height = wanted_m
     for foot, side in zip(feet, SIDES, strict=True):
-        first, second = (_length(rig, f"{side}_{bone}") for bone in ("shank", "foot"))
+        offsets = (rig.offset[BONE[f"{side}_{bone}"]] for bone in ("shank", "foot"))
+        first, second = (float(np.sqrt(np.sum(offset**2))) for offset in offsets)
         hip = rotate(pelvis, rig.offset[BONE[f"{side}_thigh"]])
         aside = np.sum((foot.ankle[:, :2] - place - hip[:, :2]) ** 2, axis=1)
         reach = first**2 + second**2 + 2 * first * second * np.cos(foot.least_knee)
@@ -290,10 +291,6 @@ def leg_rotations(rig: Rig, root: Float, pelvis: Float, feet: Sequence[Foot]) ->
             rig.offset[BONE[f"{side}_shank"]], rig.offset[BONE[f"{side}_foot"]], foot.ankle - hip, hinge
         )
     return bones
-
-
-def _length(rig: Rig, bone: str) -> float:
-    return float(np.sqrt(np.sum(rig.offset[BONE[bone]] ** 2)))
 
 
 # --- bones ---------------------------------------------------------------------------------------------

@@ -307,7 +307,9 @@ def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
             lost.counts[PLACELESS] += 1
             continue
         with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity stay, and are counted
-            voxels.add(points if _is_the_world(pose) else transform(pose, points), t_ns)
+            # Points of the world's own frame keep every bit.
+            is_world = not pose[0].any() and pose[1].tolist() == [0.0, 0.0, 0.0, 1.0]
+            voxels.add(points if is_world else transform(pose, points), t_ns)
         clouds += 1
     lost.counts.update(voxels.dropped)
     grew_ns = voxels.grew_ns
@@ -346,8 +348,3 @@ def cloud_points(value: Any, source: str) -> Float:
     records = np.frombuffer(rows.tobytes(), layout)
     with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN warns
         return np.stack([records[name].astype(np.float64) for name in names], axis=1)
-
-
-def _is_the_world(pose: Pose) -> bool:
-    """Return True for the identity pose: points of the world's own frame then keep every bit."""
-    return not pose[0].any() and pose[1].tolist() == [0.0, 0.0, 0.0, 1.0]

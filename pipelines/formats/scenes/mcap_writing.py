@@ -350,7 +350,7 @@ def _pictures(
             yield t_ns, f"{topic}/image/video", "foxglove_msgs/msg/CompressedVideo", video
             is_empty = False
     if is_empty:
-        for t_ns in _seconds(span_ns):
+        for t_ns in range(span_ns[0], span_ns[1] + 1, round(1e9 / _STANDING_HZ)):
             yield _info(t_ns, name, topic, lens)
 
 
@@ -389,10 +389,6 @@ def _map(recording: Recording, start_ns: int) -> Iterator[Entry]:
 # --- pieces --------------------------------------------------------------------------------------------
 
 _POSE = {"orientation": {"w": 1.0}}
-
-
-def _seconds(span_ns: tuple[int, int]) -> range:
-    return range(span_ns[0], span_ns[1] + 1, round(1e9 / _STANDING_HZ))
 
 
 def _xyz(point: Float) -> dict[str, float]:

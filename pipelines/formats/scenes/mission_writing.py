@@ -40,8 +40,9 @@ _LOWEST_TAKE_OFF_M = 1.2
 _KML, _WPML = "http://www.opengis.net/kml/2.2", "http://www.dji.com/wpmz/1.0.2"
 # Zip files cannot hold an earlier date, and any other one would differ from run to run.
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-# The numbers of MAVLink for commands and for no frame.
+# The numbers of MAVLink for commands.
 _WAYPOINT, _RETURN, _TAKE_OFF, _SPEED, _GIMBAL = 16, 20, 22, 178, 205
+# The number of MAVLink for commands without a frame.
 _NO_FRAME = 2
 # How QGroundControl and MAVLink say that a height counts from home.
 _ABOVE_HOME = {"frame": 3, "AltitudeMode": 1, "AMSLAltAboveTerrain": None}

@@ -107,21 +107,16 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
             progress.note(f"{source}: times are up to {off_ns / 1e6:.3f} ms off a constant rate; kept")
         row = np.full(len(even_ns), -1)
         row[index] = np.arange(len(index))
-        even = _taken(motion, row, replace(motion, t_ns=even_ns, position=_rows(motion.position, row)))
+        position = _rows(motion.position, row)
     else:
         progress.note(
             f"{source}: times are up to {off_ns / 1e6:.3f} ms off a constant rate; "
             f"positions were interpolated to {1e9 / step_ns:.6g} Hz"
         )
-        even = _interpolated(motion, even_ns, round(_LONGEST_STEP * step_ns))
+        row, longest_ns = nearest_rows(t_ns, even_ns), round(_LONGEST_STEP * step_ns)
+        position = interpolate_points(t_ns, motion.position, even_ns, max_gap_ns=longest_ns)
+    even = _taken(motion, row, replace(motion, t_ns=even_ns, position=position))
     return EvenMotion(even, 1e9 / step_ns, frames - len(t_ns))
-
-
-def _interpolated(motion: JointMotion, even_ns: Int64, longest_ns: int) -> JointMotion:
-    position = interpolate_points(motion.t_ns, motion.position, even_ns, max_gap_ns=longest_ns)
-    return _taken(
-        motion, nearest_rows(motion.t_ns, even_ns), replace(motion, t_ns=even_ns, position=position)
-    )
 
 
 def _taken(motion: JointMotion, row: Int64, even: JointMotion) -> JointMotion:
