@@ -6,7 +6,7 @@ shapes disagree, or stamps do not increase.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,11 +121,10 @@ def _aligned_as(own: Float, true: Float, samples: int) -> Float:
 
 def error_series(
     estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64
-) -> tuple[dict[str, Series], dict[str, dict[str, Series]]]:
-    """Compute the errors of `measure` at each time, over all joints and per joint."""
+) -> tuple[dict[str, Series], Iterator[dict[str, Series]]]:
+    """Compute the errors of `measure` at each time, over all joints, and of each joint as it is asked for."""
     distances = _distances(estimate, truth, joints, t_ns)
-    per_joint = {name: distances.series(slice(j, j + 1)) for j, name in enumerate(joints)}
-    return distances.series(slice(None)), per_joint
+    return distances.series(slice(None)), (distances.series(slice(j, j + 1)) for j in range(len(joints)))
 
 
 def root_relative_distances(estimate: Float, truth: Float, joints: Sequence[str]) -> Float:

@@ -137,15 +137,17 @@ def _intervals(
 ) -> dict[str, Any]:
     """Compute confidence intervals of the means over the flight by block bootstrap (`geometry.metrics`)."""
     whole: dict[str, Series] = {}
-    per_joint: dict[str, dict[str, Series]] = {name: {} for name in joints}
+    per_joint: Iterator[dict[str, Series]] = ({} for _ in joints)
     if own is not None:
         whole, per_joint = error_series(position, own, joints, t_ns)
         whole["reconstructed_share_of_truth"] = whole.pop("reconstructed_share")
     whole["reconstructed_share"] = _share(status)
     whole["reprojection_px_mean"] = _summed(residual)
-    for j, series in enumerate(per_joint.values()):
+    of_joints = {}
+    for j, (name, series) in enumerate(zip(joints, per_joint, strict=True)):
         series["reconstructed_share"] = _share(status[:, :, [j]])
         series["reprojection_px_mean"] = _summed(residual[:, :, [j]])
+        of_joints[name] = intervals({key: series[key] for key in _PER_JOINT if key in series}, t_ns)
     step_s = float(np.median(np.diff(t_ns))) / 1e9 if len(t_ns) > 1 else 0.0
     return {
         "level": LEVEL,
@@ -154,10 +156,7 @@ def _intervals(
         "resamples": RESAMPLES,
         "seed": 0,
         **intervals(whole, t_ns),
-        "per_joint": {
-            name: intervals({key: series[key] for key in _PER_JOINT if key in series}, t_ns)
-            for name, series in per_joint.items()
-        },
+        "per_joint": of_joints,
     }
 
 
