@@ -61,8 +61,6 @@ _NOISE_SAMPLE = 20_000
 _NOISE_ROUNDS = 2
 # A constant pose error gives few different pairs: undoubled, 2 % of draws of three cameras lost all joints.
 _START_WIDTH = 2.0
-# Rays that leave a direction open are taken to determine it by this share of what they determine in all.
-_LEAST_INFORMATION = 1e-12
 
 
 @dataclass(frozen=True)
@@ -154,6 +152,7 @@ class _Poses(NamedTuple):
     known: Bool  # [F, C]
     middle: Float  # [F, 3] m
     rows: Float  # [F, C, 12]: rotation by rows, centre
+    sigma: Float  # [F, C, 2], m and rad
 
 
 def _poses_of(views: Views) -> _Poses:
@@ -163,65 +162,51 @@ def _poses_of(views: Views) -> _Poses:
     middle = np.where(known[..., None], views.position, 0.0).sum(axis=1) / count
     rotation = views.rotation.reshape(*known.shape, 9)
     rows = np.concatenate([rotation, views.position - middle[:, None]], axis=-1)
-    # In one order, so that what reads them is compiled once.
-    return _Poses(known, middle, np.ascontiguousarray(np.where(known[..., None], rows, 0.0)))
+    rows = np.where(known[..., None], rows, 0.0)
+    return _Poses(known, middle, _plain(rows), _plain(views.pose_sigma))
+
+
+def _plain(values: Float) -> Float:
+    """Store an array in the one order and type for which the kernels are compiled."""
+    return np.ascontiguousarray(values, np.float64)
 
 
 def _triangulate_block(
     views: Views, poses: _Poses, method: Method, gate: float, with_covariance: bool
 ) -> tuple[Float, Bool, Int8, Float, Int64, Float]:
     """Triangulate some joint-frames; return the fields of `Triangulation`."""
-    at = views.pose_index
-    detected: Bool = np.asarray(
-        (views.weight > 0) & np.isfinite(views.weight) & np.isfinite(views.rays).all(axis=-1)
-    )
-    seen: Bool = detected & poses.known[at]
-    rays = np.where(seen[..., None], views.rays, 0.0)
-    weight = np.where(seen, views.weight, 0.0)
-    rows = poses.rows[at]
-    rotation, centre = rows[..., :9].reshape(*seen.shape, 3, 3), rows[..., 9:]
-    along = np.concatenate([rays, np.ones((*seen.shape, 1))], axis=-1)
-    direction = (rotation @ along[..., None])[..., 0]
-    length2 = (along**2).sum(axis=-1)
-    cos2_min = cos(radians(MIN_PARALLAX_DEG)) ** 2
-    apart = (direction @ direction.mT) ** 2 < cos2_min * length2[:, :, None] * length2[:, None]
-    wide = (apart & seen[:, :, None] & seen[:, None]).any(axis=(1, 2))
-    reasons = (
-        ("not_detected", ~detected.any(axis=1)),
-        ("few_views", detected.sum(axis=1) < 2),
-        ("no_pose", seen.sum(axis=1) < 2),
-        ("low_parallax", ~wide),
-    )
-    status = np.select([where for _, where in reasons], [STATUS.index(word) for word, _ in reasons], 0)
-    status = status.astype(np.int8)
-    inlier = seen.copy()
-    if method == "dlt":
-        point = _linear_points(rotation, centre, along, seen & (status == 0)[:, None])
-    else:
-        point = _midpoints(direction / np.sqrt(length2)[..., None], centre, weight**2, status == 0)
-    noise = _image_covariance(views, rays, weight)
-    if method == "robust":
-        from pipelines.geometry.triangulation_kernels import fit_robustly
+    from pipelines.geometry.triangulation_kernels import fit_robustly, prepare
 
-        view = np.concatenate([rays, direction, length2[..., None], *noise], axis=-1)
-        pairs = _pair_table(seen.shape[1])
+    shape, at = views.weight.shape, views.pose_index
+    cos2_min = cos(radians(MIN_PARALLAX_DEG)) ** 2
+    view, inlier = np.zeros((*shape, 12)), np.zeros(shape, np.bool_)
+    point, status = np.zeros((len(at), 3)), np.zeros(len(at), np.int8)
+    found = (view, inlier, point, status)
+    given = map(_plain, (views.rays, views.weight, (views.pixel_sigma / views.focal) ** 2))
+    prepare(*given, poses.sigma, at, poses.known, poses.rows, cos2_min, *found)
+    if method == "robust":
+        pairs = _pair_table(shape[1])
         fit_robustly(view, poses.rows, at, *pairs, gate**2, cos2_min, point, inlier, status)
     if method != "robust" or with_covariance:
+        rows = poses.rows[at]
+        rotation, centre = rows[..., :9].reshape(*shape, 3, 3), rows[..., 9:]
+        if method == "dlt":
+            point = _linear_points(rotation, centre, view[..., :2], inlier & (status == 0)[:, None])
         place = (rotation.mT @ (point[:, None] - centre)[..., None])[..., 0]
     if method != "robust":
-        behind = (seen & ~(place[..., 2] > 0)).any(axis=1)
+        behind = (inlier & ~(place[..., 2] > 0)).any(axis=1)
         status[(status == 0) & behind] = STATUS.index("rejected")
     ok = status == 0
     inlier &= ok[:, None]
     covariance = np.full((len(ok), 3, 3), np.nan)
     if with_covariance:
-        covariance[ok] = _covariance(method, place, rotation, length2, weight, noise, inlier)[ok]
+        covariance[ok] = _covariance(method, place, rotation, views.weight, view[..., 5:], inlier)[ok]
     points = np.where(ok[:, None], point + poses.middle[at], np.nan)
-    off_px = reprojection_px(views, points) if with_covariance else np.full(seen.shape, np.nan)
+    off_px = reprojection_px(views, points) if with_covariance else np.full(shape, np.nan)
     return points, inlier, status, covariance, inlier.sum(axis=1), off_px
 
 
-def _linear_points(rotation: Float, centre: Float, along: Float, seen: Bool) -> Float:
+def _linear_points(rotation: Float, centre: Float, rays: Float, seen: Bool) -> Float:
     """Triangulate each joint-frame [N, 3] by pycolmap from the seen views; NaN where it finds no point."""
     from pycolmap import triangulate_multi_view_point
 
@@ -229,6 +214,7 @@ def _linear_points(rotation: Float, centre: Float, along: Float, seen: Bool) -> 
     unit = np.where(spread > 0, np.sqrt(spread), 1.0)  # [N] m
     shift = -rotation.mT @ (centre / unit[:, None, None])[..., None]
     projection = np.concatenate([rotation.mT, shift], axis=-1)
+    along = np.concatenate([rays, np.ones((*seen.shape, 1))], axis=-1)
     direction = along / np.linalg.norm(along, axis=-1, keepdims=True)
     points = np.full((len(seen), 3), np.nan)
     for n in np.flatnonzero(seen.any(axis=1)):
@@ -238,53 +224,28 @@ def _linear_points(rotation: Float, centre: Float, along: Float, seen: Bool) -> 
     return points * unit[:, None]
 
 
-def _midpoints(direction: Float, centre: Float, weight: Float, wanted: Bool) -> Float:
-    """Compute the points [N, 3] closest to the viewing lines: sum w (I - d d') (X - c) = 0."""
-    beside = centre - direction * np.einsum("nca,nca->nc", direction, centre)[..., None]
-    along = (direction * weight[..., None]).mT @ direction
-    total = weight.sum(axis=1)[:, None, None] * np.eye(3)
-    normal = np.where(wanted[:, None, None], total - along, np.eye(3))
-    return np.linalg.solve(_closed(normal), np.einsum("nc,nca->na", weight, beside)[..., None])[..., 0]
-
-
 def _closed(normal: Float) -> Float:
     """Add a little information to normal matrices [N, 3, 3] of less than full rank."""
+    from pipelines.geometry.triangulation_kernels import LEAST_DETERMINANT, LEAST_INFORMATION
+
     trace = np.maximum(np.trace(normal, axis1=1, axis2=2), np.finfo(float).tiny ** 0.5)
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(normal / trace[:, None, None], 0, -1)
-    is_open = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) <= 3.0 * np.finfo(float).eps
-    more = np.where(is_open, _LEAST_INFORMATION * trace, 0.0)[:, None, None] * np.eye(3)
+    is_open = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) <= LEAST_DETERMINANT
+    more = np.where(is_open, LEAST_INFORMATION * trace, 0.0)[:, None, None] * np.eye(3)
     return np.asarray(normal + more)
-
-
-def _image_covariance(views: Views, rays: Float, weight: Float) -> tuple[Float, Float]:
-    """Compute covariances xx, xy, yy of image points: from pixels and rotation; and from position at depth 1.
-
-    The image moves by J t under a shift t and by L w under a turn w of the camera, with the interaction
-    matrices J = [1 0 -x; 0 1 -y]/z and L = [xy, -1-x^2, y; 1+y^2, -xy, -x] (Chaumette and Hutchinson
-    2006, eq. 11).
-    """
-    shift, turn = np.moveaxis(views.pose_sigma[views.pose_index] ** 2, -1, 0)
-    pixel = (views.pixel_sigma / views.focal) ** 2 / np.where(weight > 0, weight, 1.0) ** 2
-    x, y = np.moveaxis(rays, -1, 0)
-    xx, yy, cross = 1.0 + x * x, 1.0 + y * y, x * y
-    turned = (
-        pixel + turn * (cross * cross + xx * xx + y * y),
-        turn * cross * (xx + yy - 1.0),
-        pixel + turn * (cross * cross + yy * yy + x * x),
-    )
-    return np.stack(turned, axis=-1), np.stack([shift * xx, shift * cross, shift * yy], axis=-1)
 
 
 def _covariance(
     method: Method,
     place: Float,
     rotation: Float,
-    length2: Float,
     weight: Float,
-    noise: tuple[Float, Float],
+    view: Float,
     inlier: Bool,
 ) -> Float:
     """Compute the covariances [N, 3, 3] of points that are at `place` [N, C, 3] in the cameras' frames.
+
+    The last numbers of `view` [N, C, 7] are the kernels' squared length and covariances of the image point.
 
     Every method solves sum J'V(r + J dX) = 0 with its own weight V of a view's image residual r. With H = sum
     J'VJ, the noise S of the views gives H^-1 (sum J'VSVJ) H^-1. For `robust`, V is S^-1; `midpoint` minimises
@@ -293,7 +254,7 @@ def _covariance(
     depth = np.where(inlier & (place[..., 2] > 0), place[..., 2], 1.0)
     image = place[..., :2] / depth[..., None]
     jacobian = (rotation.mT[..., :2, :] - image[..., None] * rotation.mT[..., 2:, :]) / depth[..., None, None]
-    spread = (noise[0] + noise[1] / depth[..., None] ** 2)[..., [[0, 1], [1, 2]]]
+    spread = (view[..., 1:4] + view[..., 4:] / depth[..., None] ** 2)[..., [[0, 1], [1, 2]]]
     if method == "robust":
         xx, xy, yy = spread[..., 0, 0], spread[..., 0, 1], spread[..., 1, 1]
         determinant = (xx * yy - xy**2)[..., None, None]
@@ -301,7 +262,7 @@ def _covariance(
     else:
         scale = depth**2 * (weight**2 if method == "midpoint" else 1.0)
         outer = image[..., :, None] * image[..., None, :]
-        by_view = scale[..., None, None] * (np.eye(2) - outer / length2[..., None, None])
+        by_view = scale[..., None, None] * (np.eye(2) - outer / view[..., :1, None])
     by_view = np.where(inlier[..., None, None], by_view, 0.0)
     weighted = by_view @ jacobian
     rows = (len(jacobian), 2 * jacobian.shape[1], 3)  # those of all views

@@ -1,4 +1,4 @@
-"""Compiled kernel of the `robust` triangulation; `triangulation` is its only user and explains the method.
+"""Compiled kernels of the triangulation; `triangulation` is their only user and explains the methods.
 
 Rows by camera: `camera` has 0-8 the world_from_camera rotation by rows and 9-11 the centre, in a world moved
 to the mean centre; `view` has 0-1 the image point, 2-4 its direction in the world (depth 1), 5 the squared
@@ -14,7 +14,13 @@ from pipelines.geometry.compilation import cached, helper
 Vector = tuple[float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]
 
-OK, LOW_PARALLAX, REJECTED = 0, 3, 4  # indices of triangulation.STATUS
+# Indices of triangulation.STATUS.
+OK, FEW_VIEWS, LOW_PARALLAX, REJECTED, NOT_DETECTED, NO_POSE = 0, 2, 3, 4, 5, 6
+
+# Rays that leave a direction open are taken to determine it by this share of what they determine in all.
+LEAST_INFORMATION = 1e-12
+# A determinant of a normal matrix of trace 1 that rounding alone can make.
+LEAST_DETERMINANT = 3.0 * 2.0**-52
 
 # Squared length, in standard deviations of the point, below which a Gauss-Newton step is the last one.
 # Measured on the walk at 5 views, the remaining error is at most 3e-4 standard deviations for pixel noise
@@ -30,6 +36,129 @@ def _are_apart(view: Float, i: int, j: int, cos2_min: float) -> bool:
     dot = view[i, 2] * view[j, 2] + view[i, 3] * view[j, 3] + view[i, 4] * view[j, 4]
     differ: bool = dot * dot < cos2_min * view[i, 5] * view[j, 5]
     return differ
+
+
+@helper
+def _image_covariance(view: Float, pixel: float, shift: float, turn: float) -> None:
+    """Write the covariances of an image point: from pixels and rotation; and from position at depth 1.
+
+    The image moves by J t under a shift t and by L w under a turn w of the camera, with the interaction
+    matrices J = [1 0 -x; 0 1 -y]/z and L = [xy, -1-x^2, y; 1+y^2, -xy, -x] (Chaumette and Hutchinson
+    2006, eq. 11).
+    """
+    x = view[0]
+    y = view[1]
+    xx = 1.0 + x * x
+    yy = 1.0 + y * y
+    cross = x * y
+    view[6] = pixel + turn * (cross * cross + xx * xx + y * y)
+    view[7] = turn * cross * (xx + yy - 1.0)
+    view[8] = pixel + turn * (cross * cross + yy * yy + x * x)
+    view[9] = shift * xx
+    view[10] = shift * cross
+    view[11] = shift * yy
+
+
+@helper
+def _closest_point(view: Float, weight: Float, seen: Bool, camera: Float) -> Vector:
+    """Compute the point closest to the seen viewing lines: sum w^2 (I - d d') (X - c) = 0."""
+    xx = xy = xz = yy = yz = zz = 0.0
+    gx = gy = gz = 0.0
+    for c in range(len(seen)):
+        if not seen[c]:
+            continue
+        w = weight[c] * weight[c]
+        a, b, d = view[c, 2], view[c, 3], view[c, 4]
+        x, y, z = camera[c, 9], camera[c, 10], camera[c, 11]
+        by = w / view[c, 5]
+        along = by * (a * x + b * y + d * z)
+        xx += w - by * a * a
+        xy -= by * a * b
+        xz -= by * a * d
+        yy += w - by * b * b
+        yz -= by * b * d
+        zz += w - by * d * d
+        gx += w * x - along * a
+        gy += w * y - along * b
+        gz += w * z - along * d
+    trace = xx + yy + zz
+    more = LEAST_INFORMATION * trace
+    for _ in range(2):
+        c0 = yy * zz - yz * yz
+        c1 = xz * yz - xy * zz
+        c2 = xy * yz - xz * yy
+        determinant = xx * c0 + xy * c1 + xz * c2
+        if determinant > LEAST_DETERMINANT * trace * trace * trace:
+            break
+        xx += more
+        yy += more
+        zz += more
+    scale = 1.0 / determinant
+    return (
+        scale * (c0 * gx + c1 * gy + c2 * gz),
+        scale * (c1 * gx + (xx * zz - xz * xz) * gy + (xy * xz - xx * yz) * gz),
+        scale * (c2 * gx + (xy * xz - xx * yz) * gy + (xx * yy - xy * xy) * gz),
+    )
+
+
+@cached
+def prepare(
+    rays: Float,
+    weight: Float,
+    pixel: Float,
+    pose_sigma: Float,
+    pose_index: Int64,
+    known: Bool,
+    camera: Float,
+    cos2_min: float,
+    view: Float,
+    seen: Bool,
+    point: Float,
+    status: Int8,
+) -> None:
+    """Write what all methods need: rows of views, usable views, the points closest to them, and statuses.
+
+    `rays`, `weight`, `pose_sigma`, `pose_index` are those of `triangulation.Views`, `pixel` [C] the variance
+    of an image point of confidence 1, `known` [F, C] where `camera` [F, C, 12] has a pose. `view` [N, C, 12],
+    `seen` [N, C], `point` [N, 3] (0 where the status is not OK) and `status` [N] are written.
+    """
+    for n in range(len(status)):
+        f = pose_index[n]
+        detected = usable = 0
+        for c in range(len(pixel)):
+            x = rays[n, c, 0]
+            y = rays[n, c, 1]
+            w = weight[n, c]
+            found = w > 0.0 and math.isfinite(w) and math.isfinite(x) and math.isfinite(y)
+            seen[n, c] = found and known[f, c]
+            detected += found
+            usable += seen[n, c]
+            if not seen[n, c]:  # what numpy computes of it stays finite
+                x = y = 0.0
+                w = 1.0
+            row = view[n, c]
+            row[0] = x
+            row[1] = y
+            for axis in range(3):
+                of = camera[f, c, 3 * axis : 3 * axis + 3]
+                row[2 + axis] = of[0] * x + of[1] * y + of[2]
+            row[5] = x * x + y * y + 1.0
+            _image_covariance(row, pixel[c] / (w * w), pose_sigma[f, c, 0] ** 2, pose_sigma[f, c, 1] ** 2)
+        wide = False
+        for i in range(len(pixel)):
+            for j in range(i + 1, len(pixel)):
+                wide = wide or (seen[n, i] and seen[n, j] and _are_apart(view[n], i, j, cos2_min))
+        if detected == 0:
+            status[n] = NOT_DETECTED
+        elif detected < 2:
+            status[n] = FEW_VIEWS
+        elif usable < 2:
+            status[n] = NO_POSE
+        elif not wide:
+            status[n] = LOW_PARALLAX
+        else:
+            point[n] = _closest_point(view[n], weight[n], seen[n], camera[f])
+            status[n] = OK
 
 
 @helper

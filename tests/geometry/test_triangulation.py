@@ -14,7 +14,6 @@ from pipelines.geometry.triangulation import (
     Method,
     Triangulation,
     _closed,
-    _midpoints,
     _pair_table,
     estimate_noise,
     triangulate,
@@ -305,10 +304,15 @@ def test_parallel_rays_leave_a_huge_and_finite_variance() -> None:
     variance = np.linalg.inv(_closed(normal))[0]
     assert variance[2, 2] > 1e11
     assert np.isfinite(variance).all()
-    point = _midpoints(
-        np.array([[[0.0, 0, 1], [0, 0, 1]]]),
-        np.array([[[0.0, 0, 0], [1, 0, 0]]]),
-        np.ones((1, 2)),
-        np.ones(1, bool),
-    )
-    assert point[0, :2] == pytest.approx([0.5, 0.0])
+
+
+def test_a_view_without_weight_to_speak_of_leaves_the_other_line() -> None:
+    truth, views = ring(1, 2)
+    weight = np.tile([1.0, 1e-9], (len(truth), 1))
+
+    result = triangulate(replace(views, weight=weight), method="midpoint")
+
+    (line,) = views.rotation[:, 0] @ np.array([*views.rays[0, 0], 1.0])
+    away = result.points[0] - views.position[0, 0]
+    assert np.isfinite(result.points).all()
+    assert np.linalg.norm(np.cross(away, line)) / np.linalg.norm(line) < 1e-4
