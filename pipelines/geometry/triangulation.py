@@ -181,9 +181,10 @@ def _triangulate_block(
     cos2_min = cos(radians(MIN_PARALLAX_DEG)) ** 2
     view, inlier = np.zeros((*shape, 12)), np.zeros(shape, np.bool_)
     point, status = np.zeros((len(at), 3)), np.zeros(len(at), np.int8)
-    found = (view, inlier, point, status)
-    given = map(_plain, (views.rays, views.weight, (views.pixel_sigma / views.focal) ** 2))
-    prepare(*given, poses.sigma, at, poses.known, poses.rows, cos2_min, *found)
+    rays, weight = _plain(views.rays), _plain(views.weight)
+    pixel, sigma = _plain((views.pixel_sigma / views.focal) ** 2), poses.sigma
+    given = (rays, weight, pixel, sigma, at, poses.known, poses.rows)
+    prepare(*given, cos2_min, view, inlier, point, status)
     if method == "robust":
         pairs = _pair_table(shape[1])
         fit_robustly(view, poses.rows, at, *pairs, gate**2, cos2_min, point, inlier, status)

@@ -642,18 +642,18 @@ class _Smoother:
         self._pixel = np.array([(PIXEL_SIGMA_PX / _focal(lens)) ** 2 for lens in paths.intrinsics])[:, None]
         across, square_m2 = _across_ray(paths.position[:, :, None] - joints)
         own = across / (self._pixel[..., None] * square_m2)[..., None, None]
-        self._information = np.moveaxis(own, 0, -1).reshape(*joints.shape[:2], 9, -1).copy()  # [T, J, 9, N]
+        self._information = own  # [N, T, J, 3, 3]
         self._away = joints - paths.position[:, :, None]
         self._axes = np.moveaxis(matrix_from_quaternion(paths.quaternion_xyzw), -1, 0)[..., None, :]
 
     def passed(self, rays: Float, seen: Bool) -> Float:
         """Compute by how much (m) rays [T, J, N, 2] pass joints that are seen [T, J, N]: means [T, N, 3]."""
-        x, y = rays.transpose(3, 2, 0, 1)[..., None]
+        where: Float = seen.transpose(2, 0, 1).astype(np.float64)
+        x, y = np.where(seen[..., None], rays, 0.0).transpose(3, 2, 0, 1)[..., None]
         along = self._axes[0] * x + self._axes[1] * y + self._axes[2]
         depth = np.einsum("ntja,ntja->ntj", along, self._away) / np.einsum("ntja,ntja->ntj", along, along)
         past = along * depth[..., None] - self._away
-        where = seen.transpose(2, 0, 1)
-        total = np.where(where[..., None], past, 0.0).sum(axis=2)
+        total = np.einsum("ntja,ntj->nta", past, where)
         count = where.sum(axis=2)[..., None]
         mean: Float = np.where(count > 0, total / np.maximum(count, 1), np.nan).swapaxes(0, 1)
         return mean
@@ -661,13 +661,13 @@ class _Smoother:
     def own(self, off: Float, seen: Bool) -> Float:
         """Smooth what errors [T, J, 3] m do not share, of joints that cameras see, [T, J, N]; NaN stays."""
         there = np.isfinite(off[..., 0])
-        own = (self._information @ seen[..., None].astype(np.float64)).reshape(*there.shape, 3, 3)
+        own = np.einsum("ntjab,tjn->tjab", self._information, seen.astype(np.float64))
+        weighted = np.einsum("tjab,tjb->tja", own, np.where(there[..., None], off, 0.0))
         total = own.sum(axis=1) + np.eye(3) / FARTHEST_M**2
-        weighted = np.einsum("tjab,tjb->ta", own, np.where(there[..., None], off, 0.0))
-        shared = np.linalg.solve(total, weighted[..., None])[:, None, :, 0]
-        series = np.where(there[..., None], off - shared, 0.0)
+        shared = np.linalg.solve(total, weighted.sum(axis=1)[..., None])[..., 0]
+        series = np.where(there[..., None], off - shared[:, None], 0.0)
         if len(off) >= MIN_SMOOTHED_TIMES:
-            right = (own @ series[..., None]).swapaxes(0, 1)
+            right = (weighted - np.einsum("tjab,tb->tja", own, shared))[..., None].swapaxes(0, 1)
             series = smooth(right, own.swapaxes(0, 1), self._stiffness[1:])[..., 0].swapaxes(0, 1)
         return np.where(there[..., None], series, np.nan)
 
@@ -799,7 +799,9 @@ def smooth(right: Float, information: Float, stiffness: Float) -> Float:
     if times >= MIN_SMOOTHED_TIMES:
         band[[6, 3, 0]] += stiff * bend[:, None]
     band[6] += LEAST_INFORMATION + LEAST_OF_STIFFNESS * stiff
-    return solveh_banded(band.reshape(7, -1), right.reshape(-1, right.shape[-1])).reshape(right.shape)
+    rows = right.reshape(-1, right.shape[-1])
+    solved = solveh_banded(band.reshape(7, -1), rows, overwrite_ab=True, check_finite=False)
+    return solved.reshape(right.shape)
 
 
 def joined(people: Sequence[MeasuredJoints]) -> MeasuredJoints:
