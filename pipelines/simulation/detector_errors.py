@@ -294,17 +294,22 @@ def _swapped(frames: int, joints: tuple[str, ...], share: float, rng: np.random.
     return swapped
 
 
+@lru_cache(maxsize=32)
 def _limb(joints: tuple[str, ...], parts: tuple[str, ...]) -> Bool:
     """Return a mask [J] of the joints of a pair of limbs whose mirror is there, too."""
     names = {f"{side}_{part}" for side in ("left", "right") for part in parts}
     return np.array([name in names and mirrored(name) in joints for name in joints], dtype=np.bool_)
 
 
+@lru_cache(maxsize=4)
+def _mirrors(joints: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the number of each joint's mirror, its own where there is none."""
+    return tuple(joints.index(mirrored(j)) if mirrored(j) in joints else k for k, j in enumerate(joints))
+
+
 def _exchanged(values: Float, swapped: Bool, joints: tuple[str, ...]) -> Float:
     """Return values [T, J, ...] with every swapped joint's taken from its mirror."""
     if not swapped.any():
         return values
-    mirror = [
-        joints.index(mirrored(name)) if mirrored(name) in joints else j for j, name in enumerate(joints)
-    ]
+    mirror = list(_mirrors(joints))
     return np.where(swapped.reshape(*swapped.shape, *(1,) * (values.ndim - 2)), values[:, mirror], values)
