@@ -173,18 +173,17 @@ def test_the_tilt_of_all_cameras_has_a_standard_deviation(flight: Described) -> 
 
 def test_fitted_numbers_are_those_of_the_least_cost(flight: Described) -> None:
     """Fit the tilt of all cameras; errors of 0.1 m in places are smaller angles of what is farther away."""
-    sampled = sampled_of(mistaken(flight, None))._replace(hips=None)
-    scene = scene_of(sampled)
+    scene = replace(scene_of(sampled_of(mistaken(flight, None))), hips=None)
     place = scene.position + np.random.default_rng(1).normal(0, 0.1, scene.position.shape)
     sigma = np.tile([0.1, scene.sigma[0, 1], 0.1, 0.0, 0.1, 0.0], (3, 1))
 
     def tilted(numbers: Float) -> SceneOfMoments:
         return changed(replace(scene, position=place, sigma=sigma), "pitch", [0, 1, 2], numbers)
 
-    found = fit(sampled, tilted, np.zeros(1), [np.inf])
+    found = fit(tilted, np.zeros(1))
     steps = float(np.sqrt(found.covariance[0, 0])) * np.array([-1, 0, 1])
     moved = [partial(lambda at, _: tilted(found.numbers + at), at) for at in steps]
-    costs = [fit(sampled, each).cost for each in moved]
+    costs = [fit(each).cost for each in moved]
     assert abs(costs[2] - costs[0]) / (costs[0] + costs[2] - 2 * costs[1]) < 0.4  # 0.2 standard deviations
 
 
@@ -465,19 +464,18 @@ def test_limbs_that_cross_are_doubted_without_a_cause(flight: Described) -> None
 
 def test_knees_and_elbows_bend_forwards_unless_left_is_right(flight: Described) -> None:
     def share(change: Change | None) -> float:
-        sampled = sampled_of(mistaken(flight, change))
-        return score(sampled, scene_of(sampled)).odd["bend"].evidence["bent_forwards_share"]
+        bend = score(scene_of(sampled_of(mistaken(flight, change)))).odd["bend"]
+        return bend.evidence["bent_forwards_share"]
 
     assert share(None) > 0.8
     assert share(with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED])) < 0.2
 
 
 def test_the_standing_foot_tells_focal_lengths_but_not_scales(flight: Described) -> None:
-    sampled = sampled_of(mistaken(flight, None))
-    right = scene_of(sampled)
+    right = scene_of(sampled_of(mistaken(flight, None)))
 
     def tread(scene: SceneOfMoments) -> Oddity:
-        return score(sampled, scene).odd["tread"]
+        return score(scene).odd["tread"]
 
     larger = replace(right, position=2 * right.position)
     assert tread(larger).evidence == pytest.approx(tread(right).evidence, rel=0.05)
@@ -489,11 +487,10 @@ def test_the_standing_foot_tells_focal_lengths_but_not_scales(flight: Described)
 
 
 def test_feet_that_rise_more_than_slopes_do_are_odd(flight: Described) -> None:
-    sampled = sampled_of(mistaken(flight, None))._replace(ground=None)
-    scene = scene_of(sampled)
-    assert score(sampled, scene).odd["level"].sigmas == 0
+    scene = replace(scene_of(sampled_of(mistaken(flight, None))), ground=None)
+    assert score(scene).odd["level"].sigmas == 0
     climbing = scene.position + np.linspace(0, 8, scene.position.shape[1])[:, None] * [0, 0, 1]
-    level = score(sampled, replace(scene, position=climbing)).odd["level"]
+    level = score(replace(scene, position=climbing)).odd["level"]
     assert level.sigmas > 5
     assert level.evidence["rise_m"] == pytest.approx(0.8 * 8, abs=1)  # from the 10th to the 90th percentile
 

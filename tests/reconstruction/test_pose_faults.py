@@ -1,7 +1,6 @@
 """Faults of one camera's poses: what is fitted to exact rays is the fault that was made."""
 
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -13,13 +12,11 @@ from pipelines.reconstruction.doubts.scene import (
     JOINTS,
     MOMENTS,
     STATURE_M,
-    Sampled,
     SceneOfMoments,
     stature_m,
 )
 from pipelines.reconstruction.doubts.score import fit, solve
 
-WITHOUT_ACTOR = cast(Sampled, type("", (), {"hips": None})())
 SIGMA = np.array([0.1, np.radians(0.5), 0.02, np.radians(0.1), 0.02, np.radians(0.1)])
 
 
@@ -41,18 +38,21 @@ def scene(cameras: int) -> SceneOfMoments:
     towards = np.broadcast_to(joints.mean(axis=1), position.shape)
     rotation = matrix_from_quaternion(look_at(position, towards))
     local = np.einsum("ctji,ctkj->ctki", rotation, joints[None] - position[:, :, None])
-    rays = local[..., :2] / local[..., 2:]
-    sigma = np.repeat(SIGMA[None], cameras, axis=0)
-    focal_px, person_px = np.full(cameras, 760.0), np.full(cameras, 140.0)
+    t_ns = 100_000_000 * np.arange(MOMENTS)
     return SceneOfMoments(
-        rays,
-        position,
-        rotation,
-        focal_px,
-        sigma,
-        person_px,
-        np.zeros(cameras),
-        np.zeros((cameras, len(rays[0]))),
+        t_ns=t_ns,
+        first=np.arange(MOMENTS)[::2],
+        second=np.arange(MOMENTS)[1::2],
+        hips=None,
+        ground=None,
+        rays=local[..., :2] / local[..., 2:],
+        position=position,
+        rotation=rotation,
+        focal_px=np.full(cameras, 760.0),
+        sigma=np.repeat(SIGMA[None], cameras, axis=0),
+        person_px=np.full(cameras, 140.0),
+        unposed=np.zeros(cameras),
+        stated_ns=np.tile(t_ns, (cameras, 1)),
     )
 
 
@@ -73,12 +73,7 @@ def test_a_fault_is_found_exactly(name: str, shift: list[float], turn_deg: float
     moved = changed(right, "shift", [1], -np.array(shift)) if any(shift) else right
     wrong = moved if name == "shift" else changed(moved, {"zero": "north"}.get(name, name), [1], -turn)
     number = np.array([*shift, *turn])[4 - NUMBERS[name] :] if NUMBERS[name] != 3 else np.array(shift)
-    found = fit(
-        WITHOUT_ACTOR,
-        lambda numbers: changed(wrong, name, [1], numbers),
-        np.zeros(NUMBERS[name]),
-        [np.inf] * NUMBERS[name],
-    )
+    found = fit(lambda numbers: changed(wrong, name, [1], numbers), np.zeros(NUMBERS[name]))
     # Exact rays leave no cost, up to the iterations' end (a change of the cost by 0.05).
     assert found.cost < 0.1
     np.testing.assert_allclose(found.numbers, number, atol=0.05 if any(shift) else np.radians(0.2))
@@ -86,13 +81,11 @@ def test_a_fault_is_found_exactly(name: str, shift: list[float], turn_deg: float
 
 def test_a_right_scene_costs_nothing_and_a_wrong_one_does() -> None:
     right = scene(3)
-    assert fit(WITHOUT_ACTOR, lambda _: right).cost < 0.1
+    assert fit(lambda _: right).cost < 0.1
     wrong = changed(right, "heading", [0], np.radians([8]))
     # 8 deg are 16 standard deviations of the error that is stated.
-    turned = fit(
-        WITHOUT_ACTOR, lambda numbers: changed(wrong, "heading", [0], numbers), np.zeros(1), [np.inf]
-    )
-    assert fit(WITHOUT_ACTOR, lambda _: wrong).cost - turned.cost > 16
+    turned = fit(lambda numbers: changed(wrong, "heading", [0], numbers), np.zeros(1))
+    assert fit(lambda _: wrong).cost - turned.cost > 16
 
 
 def test_joints_are_where_exact_rays_meet() -> None:

@@ -15,7 +15,6 @@ from pipelines.geometry.poses import (
 )
 from pipelines.reconstruction.background import clocks_of_backgrounds, turned_aside, with_known_mount
 from pipelines.reconstruction.background_tracks import Followed, Tracks
-from pipelines.reconstruction.doubts.alternatives import RATES
 from pipelines.reconstruction.doubts.turning import Lateness, common_offset, lateness, turns_of
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
@@ -74,7 +73,7 @@ class Turning:
 def found(cameras: list[Turning]) -> Lateness | None:
     team: list[Any] = list(cameras)
     turns = {index: turns_of(camera, camera.followed()) for index, camera in enumerate(team)}
-    return next(iter(lateness(team, turns, BETWEEN, RATES)), None)
+    return next(iter(lateness(team, turns, BETWEEN, [int(each.frame_t_ns[0]) for each in team])), None)
 
 
 def late(seconds: float, phase: float, slower: float = 1.0) -> Turning:
@@ -112,9 +111,10 @@ def test_a_frame_rate_counts_from_the_first_picture_of_the_flight() -> None:
     whole: list[Any] = [late(0.0, phase, 1.2) for phase in (0.1, 1.3)]
     turns = {index: turns_of(camera, camera.followed()) for index, camera in enumerate(whole)}
     part = [replace(camera, frame_t_ns=camera.frame_t_ns[60:]) for camera in whole]
-    first, *_ = lateness(part, turns, BETWEEN, RATES, [0, 0])
+    starts = [int(camera.frame_t_ns[0]) for camera in part]
+    first, *_ = lateness(part, turns, BETWEEN, [0, 0])
     assert first.slower == pytest.approx(25 / 30)
-    assert first.gain > 50 + max(each.gain for each in lateness(part, turns, BETWEEN, RATES))
+    assert first.gain > 50 + max(each.gain for each in lateness(part, turns, BETWEEN, starts))
 
 
 def test_cameras_that_do_not_turn_tell_nothing() -> None:

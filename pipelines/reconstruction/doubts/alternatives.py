@@ -41,9 +41,6 @@ from pipelines.reconstruction.observations import Filmed
 from pipelines.reconstruction.solving import NOSE_TO_ANKLES
 from pipelines.session.people import mirrored
 
-RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
-"""Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
-
 PRICE_OF_ALL = 0.5
 """Price of an alternative of all cameras alike."""
 
@@ -57,8 +54,6 @@ _SIZE_FACTORS = (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3)  # pictures that a detector w
 _UNITS_M = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
 # Cameras film at these rates, or at 1000/1001 of them, but for rounding.
 _USUAL_RATES_HZ, _SAME_RATE = (24.0, 25.0, 30.0, 50.0, 60.0), 2e-3
-# Of the pictures of a detector few are looked at, so other rates than these may be right.
-_PRICE_OF_UNUSUAL_RATE = 1.0
 # Logs go on about as long as pictures: a rate pays this, times the share of logs that it leaves unfilmed.
 _PRICE_OF_UNFILMED = 3.0
 # A stated value is doubted beyond this many of its standard deviations, because errors have heavy tails.
@@ -85,12 +80,11 @@ class Alternative:
     same_scatter: bool = False
     evidence: Mapping[str, float] = field(default_factory=dict)
     # Of times of all cameras: the scene of the same pictures, at the moments of the flight beside it.
-    same_pictures: Callable[[], tuple[SceneOfMoments, Sampled]] | None = None
-    flight: Sampled | None = None  # where a map and an actor are other than described
+    same_pictures: Callable[[], SceneOfMoments] | None = None
 
 
-Group = tuple[Sequence[int] | None, float]
-"""Cameras of an alternative, None for all that move, and its price."""
+Group = tuple[list[int], float]
+"""Cameras of an alternative, and its price."""
 
 
 @dataclass(frozen=True)
@@ -123,11 +117,18 @@ class Trial:
         """Return the name of one camera, or `every camera`."""
         return self.names[group[0]] if len(group) == 1 < len(self.names) else "every camera"
 
-    def groups(self, members: Sequence[int]) -> Iterator[tuple[list[int], float]]:
+    def groups(self, members: Sequence[int]) -> Iterator[Group]:
         """Take all cameras together, then each, which is dearer."""
         if len(members) > 1:
             yield list(members), PRICE_OF_ALL
         yield from (([index], _PRICE_OF_ONE) for index in members)
+
+    def kinds_of_logs(self) -> list[list[int]]:
+        """Group the cameras whose poses one program wrote, where there are several such and others."""
+        kinds: dict[str, list[int]] = {}
+        for index in self.moving:
+            kinds.setdefault(Path(self.cameras[index].entry.poses.source).suffix.lower(), []).append(index)
+        return [kind for kind in kinds.values() if 1 < len(kind) < len(self.moving)]
 
     def lines(self, group: Sequence[int], line_of: Callable[..., str], *values: Any, **named: Any) -> str:
         """Write the lines of a remedy for the cameras of a group."""
@@ -157,22 +158,21 @@ class Trial:
         """Add seconds to the times of cameras' pictures, and let them follow each other more slowly."""
         return scene_of(self.flight, self.described, times=dict.fromkeys(group, (late_s, slower)))
 
-    def with_all_times(self, late_s: float, slower: float) -> tuple[SceneOfMoments, Sampled]:
+    def with_all_times(self, late_s: float, slower: float) -> SceneOfMoments:
         """Change all times and look at the same pictures, at the moments at which they were taken then."""
         moved = self.flight.at_other_times(late_s, slower)
-        return scene_of(moved, times=dict.fromkeys(self.every, (late_s, slower))), moved
+        return scene_of(moved, times=dict.fromkeys(self.every, (late_s, slower)))
 
     def posed(
         self, code: str, what: str, remedy: str, of: Group, rotation: Float, position: Float | None = None
     ) -> Alternative:
         """Take the attitudes [C, T, 3, 3] and places [C, T, 3] of some cameras from other ones."""
         group, price = of
-        own, names = (self.moving, self.names) if group is None else (list(group), self.named(group))
         turned, moved = self.described.rotation.copy(), self.described.position.copy()
-        turned[own], moved[own] = rotation[own], (moved if position is None else position)[own]
+        turned[group], moved[group] = rotation[group], (moved if position is None else position)[group]
         scene = replace(self.described, rotation=turned, position=moved)
-        same_scatter = code == "unit" and group is None  # larger errors of larger positions
-        return Alternative(code, names, what, remedy, price, scene, same_scatter)
+        same_scatter = code == "unit" and group == self.moving  # larger errors of larger positions
+        return Alternative(code, self.named(group), what, remedy, price, scene, same_scatter)
 
     def with_pixels(
         self, group: Sequence[int], factor: float = 1.0, flipped: Set[str] = frozenset()
@@ -201,16 +201,10 @@ def rates(trial: Trial) -> Iterator[Alternative]:
     """Try other frame rates of all cameras and of each."""
     for group, price in trial.groups(trial.every):
         stated_hz = remedies.rate_hz(trial.cameras[group[0]])
-        others = (hz for hz in _USUAL_RATES_HZ if abs(stated_hz / hz - 1) > _SAME_RATE)
-        for factor in (stated_hz / hz for hz in others) if _is_usual(stated_hz) else RATES:
+        for factor in (stated_hz / hz for hz in _USUAL_RATES_HZ if abs(stated_hz / hz - 1) > _SAME_RATE):
             unfilmed = [_unfilmed(trial.cameras[k], factor) - _unfilmed(trial.cameras[k]) for k in group]
             dearer = max(0.0, _PRICE_OF_UNFILMED * float(np.mean(unfilmed)))
-            dearer += _PRICE_OF_UNUSUAL_RATE * (not _is_usual(stated_hz / factor))
             yield of_times(trial, group, slower=factor, price=price + dearer)
-
-
-def _is_usual(rate_hz: float) -> bool:
-    return min(abs(rate_hz / usual - 1) for usual in _USUAL_RATES_HZ) < _SAME_RATE
 
 
 def _unfilmed(camera: Filmed, slower: float = 1.0) -> float:
@@ -316,7 +310,9 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
     if flight.truth_m is not None:
         alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
     for of_poses in (alone, not alone) if flight.truth_m is None and trial.located else (alone,):
-        placed = flight if of_poses else flight.scaled(size)
+        hips, ground = flight.hips, flight.ground
+        if not of_poses:
+            hips, ground = None if hips is None else size * hips, ground and ground.scaled(size)
         if of_poses and unit is not None:
             factor, code, cost, evidence = _UNITS_M[unit], "unit", PRICE_OF_ALL, {}
             what = f"the positions are in {unit}"
@@ -330,8 +326,9 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
             remedy = of_logs if of_poses else f"world.scale: {size:.3g}"
         # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
         of_places = np.array([factor, 1.0] * 3)
-        scene = replace(described, position=described.position * factor, sigma=described.sigma * of_places)
-        yield Alternative(code, trial.names, what, remedy, cost, scene, True, evidence, flight=placed)
+        place, sigma = described.position * factor, described.sigma * of_places
+        scene = replace(described, position=place, sigma=sigma, hips=hips, ground=ground)
+        yield Alternative(code, trial.names, what, remedy, cost, scene, True, evidence)
 
 
 def _scaled_to_actor(trial: Trial, joints: Float, size: float) -> tuple[float, float]:
@@ -357,13 +354,7 @@ def discrete(trial: Trial) -> Iterator[Alternative]:
     """Try exchanged pictures, other mounts and gimbals, other conventions, and other keypoints."""
     yield from _exchanged_pictures(trial)
     if trial.moving:
-        written: dict[tuple[str, bool], list[int]] = {}  # who wrote the poses
-        for index in trial.moving:
-            poses = trial.cameras[index].entry.poses
-            written.setdefault((Path(poses.source).suffix.lower(), poses.topic is None), []).append(index)
-        kinds = [*(written.values() if len(written) > 1 else ())]
-        kinds += [[index] for index in trial.moving if len(trial.moving) > 1 and [index] not in kinds]
-        groups: list[Group] = [(None, PRICE_OF_ALL), *((kind, _PRICE_OF_ONE) for kind in kinds)]
+        groups = [*trial.groups(trial.moving), *((kind, _PRICE_OF_ONE) for kind in trial.kinds_of_logs())]
         yield from chain(_mounts(trial), _gimbals(trial), *(_conventions(trial, of) for of in groups))
         yield from chain(*(_units(trial, of) for of in groups))
     yield from _keypoints(trial)
@@ -459,7 +450,7 @@ def _frames(body: Float) -> dict[str, Float]:
 
 def _conventions(trial: Trial, of: Group) -> Iterator[Alternative]:
     """Try other meanings of the logged poses: axes, inverses, orders of quaternions."""
-    moving = trial.moving if of[0] is None else of[0]
+    moving = of[0]
     mounts, camera, place = trial.mounts, trial.described.rotation, trial.described.position
     body, on_gimbal = trial.bodies
 
@@ -519,9 +510,9 @@ def _conventions(trial: Trial, of: Group) -> Iterator[Alternative]:
 
 def _units(trial: Trial, of: Group) -> Iterator[Alternative]:
     """Try other units of the logged positions, of cameras as in `_conventions`."""
-    moving = trial.moving if of[0] is None else of[0]
+    moving = of[0]
     camera, place = trial.described.rotation, trial.described.position
-    whose = "" if of[0] is None else f" of {', '.join(trial.named(of[0]))}"
+    whose = "" if moving == trial.moving else f" of {', '.join(trial.named(moving))}"
     # Lever arms are stated in metres, whatever the log's unit.
     levers = np.array([each.lever_m for each in trial.cameras])
     arms = np.einsum("ctij,cj->cti", trial.bodies[0], levers)
@@ -564,7 +555,8 @@ def _keypoints(trial: Trial) -> Iterator[Alternative]:
 NUMBERS = {"shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 1, "focal": 1}
 """Numbers of a description that may be wrong, and how many of them each alternative sets free.
 
-`shift`: the log has its zero elsewhere; `north`: it has its north elsewhere; `zero`: both. `heading`,
+`shift`: each log has its zero elsewhere, by numbers of its own; `north`: it has its north elsewhere; `zero`:
+both. `heading`,
 `pitch`, `roll`: the camera is turned where it is, about the vertical or its own x and z axes. `focal`: its
 focal length is another; the number is then the logarithm of the factor.
 """
@@ -603,7 +595,7 @@ def changed(scene: SceneOfMoments, kind: str, group: Sequence[int], numbers: Flo
         if kind in ("north", "zero"):
             position[chosen] = position[chosen] @ turn.T
     if kind in ("shift", "zero"):
-        position[chosen] = position[chosen] + numbers[:3]
+        position[chosen] += numbers[: len(numbers) // 3 * 3].reshape(-1, 1, 3)
     return replace(scene, rotation=rotation, position=position)
 
 
@@ -672,25 +664,27 @@ def _of_numbers(
         return None
     number, variance, (code, sentence) = float(numbers[-1]), np.diag(covariance), _FAULTS[kind]
     degrees = float(np.degrees(number)) if kind != "shift" else 0.0
-    shift = numbers[:3] if NUMBERS[kind] >= 3 else np.zeros(3)
-    measured = {"far_m": np.linalg.norm(shift), "degrees": degrees, "factor": zoom(number)}
+    shifts = numbers[: len(numbers) // 3 * 3].reshape(-1, 3)
+    measured = {"far_m": np.linalg.norm(shifts), "degrees": degrees, "factor": zoom(number)}
     tilt = f"{abs(degrees):.0f} deg {'higher' if degrees > 0 else 'lower'}"
     what = sentence.format(whose=trial.whose(group), tilt=tilt, **measured)
     turn = turn_about("x" if kind == "pitch" else "z", degrees)
     if kind == "focal":
         remedy = trial.lines(group, remedies.lens, zoom(number))
     elif code == "origin":
-        remedy = trial.lines(group, remedies.placed, shift, turn)
+        moved = zip(group, shifts if len(shifts) else np.zeros((1, 3)), strict=True)
+        remedy = "; ".join(trial.lines([index], remedies.placed, shift, turn) for index, shift in moved)
     elif code == "mount":
         remedy = trial.lines(group, remedies.mount, after=turn)
     else:
         remedy = _turned_about_vertical(trial, group, number)
     evidence = {}
-    if NUMBERS[kind] >= 3:
-        evidence["shift_sigma_m"] = round(float(np.sqrt(variance[:3].sum())), 2)
+    if shifts.size and variance.size:
+        parts = variance[: shifts.size].reshape(-1, 3).sum(axis=1)
+        evidence["shift_sigma_m"] = round(float(np.sqrt(parts.max())), 2)
     if kind not in ("shift", "focal") and variance.size:
         evidence["turn_sigma_deg"] = round(float(np.degrees(np.sqrt(variance[-1]))), 2)
-    price = _PRICE_OF_ONE if len(group) < len(trial.names) else _OF_ALL[kind]
+    price = _PRICE_OF_ONE if len(group) < len(trial.names) else _OF_ALL.get(kind, PRICE_OF_ALL)
     return Alternative(code, trial.named(group), what, remedy, price, evidence=evidence)
 
 
@@ -718,21 +712,11 @@ def own_origins(trial: Trial, cameras: tuple[str, ...], what: str) -> Numbers:
     apart = (seen[0] if flight.hips is None else flight.hips) - seen
     start = [np.nanmedian(apart[i], axis=0) if np.isfinite(apart[i]).any() else np.zeros(3) for i in moved]
 
-    def make(numbers: Float) -> SceneOfMoments:
-        position = scene.position.copy()
-        position[moved] += numbers.reshape(-1, 1, 3)
-        return replace(scene, position=position)
-
     def alternative(numbers: Float, covariance: Float) -> Alternative | None:
-        if not _is_fault(trial, "shift", moved, numbers, covariance):
-            return None
-        sigma_m = np.sqrt(np.diag(covariance).reshape(-1, 3).sum(axis=1)).max() if covariance.size else 0.0
-        shifts = zip(moved, numbers.reshape(-1, 3), strict=True)
-        remedy = "; ".join(trial.lines([index], remedies.placed, shift) for index, shift in shifts)
-        evidence = {"shift_sigma_m": round(sigma_m, 2)}
-        return Alternative("origin", cameras, what, remedy, PRICE_OF_ALL, None, True, evidence)
+        found = _of_numbers(trial, "shift", moved, numbers, covariance)
+        return found and replace(found, cameras=cameras, what=what, price=PRICE_OF_ALL, same_scatter=True)
 
-    return Numbers(make, np.concatenate(start)[None], alternative)
+    return Numbers(partial(changed, scene, "shift", moved), np.concatenate(start)[None], alternative)
 
 
 # --- errors that are larger than stated ------------------------------------------------------------------

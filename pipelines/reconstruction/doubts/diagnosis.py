@@ -16,11 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
+from pipelines.reconstruction.background import turned_aside
 from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.doubts import alternatives, remedies
 from pipelines.reconstruction.doubts.alternatives import (
-    PRICE_OF_ALL,
-    RATES,
     Alternative,
     Numbers,
     Trial,
@@ -49,7 +48,7 @@ from pipelines.reconstruction.doubts.score import (
 from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
 from pipelines.reconstruction.loading import load_truth
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.description import Description, Doubt, Interpolation
+from pipelines.session.description import Description, Doubt
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 
@@ -76,14 +75,8 @@ _STRANGE = 5.0
 _STRANGE_SIZE = 2.5
 # Score of a description above which it is doubted although no alternative explains it.
 _DOUBTFUL = 6.0
-# Logs nearer to each other than this do not tell own origins from positions in a smaller unit.
-_HOVERING_M = 0.5
-# Drones that all fly lower than this below zero count heights downwards.
-_BELOW_M = 1.0
 # Alternatives that lower the objective by this much less than the best are stated beside it.
 _ALIKE = 1.0
-# Numbers that nothing shows stay within this, in m, rad or logarithms.
-_LOOSE = 30.0
 # Numbers may be of five magnitudes, each e times the other: twice the logarithm of that is paid for it.
 _OF_ANY_SIZE = 3.2
 # So many alternatives of the best scores are fitted to the rays.
@@ -113,7 +106,6 @@ def doubts_of(
     *,
     chosen: Sequence[Int64],
     followed: Mapping[str, object],
-    aside: Callable[[Camera, Followed, Interpolation], tuple[float, float] | None],
     pose_noise: str | None = None,
 ) -> list[Doubt]:
     """Diagnose a session.
@@ -127,7 +119,6 @@ def doubts_of(
         cameras: with their detections.
         chosen: which detection [F] of each camera's pictures the actor is, -1 for none.
         followed: backgrounds of cameras by name; what is none is ignored.
-        aside: finds by how much a camera looks beside its log (`background.turned_aside`).
         pose_noise: the value of `--pose-noise`, if any.
 
     Raises:
@@ -142,7 +133,7 @@ def doubts_of(
         sample, cameras, description, actor=actor, last_map=last[0] if last else None, pose_noise=pose_noise
     )
     first_ns = [description.cameras[camera.name].frames.first_t_ns for camera in cameras]
-    late = lateness(cameras, all_turns(cameras, followed), between, RATES, first_ns)
+    late = lateness(cameras, all_turns(cameras, followed), between, first_ns)
     flight = _more_plausible(known(chosen=chosen), known())
     truth = load_truth(folder, description, JOINTS)
     if flight is not None and truth is not None:
@@ -153,7 +144,7 @@ def doubts_of(
         seen = followed.get(camera.name)
         # Attitudes by pictures are not compared with themselves.
         if isinstance(seen, Followed) and camera.entry.picture_map is None:
-            looks[index] = partial(aside, camera.camera, seen, between)
+            looks[index] = partial(turned_aside, camera.camera, seen, between)
     found = diagnose(flight, late, looks)
     # A gimbal that nothing uses, where it can be, explains more than any other change would.
     unused = [doubt for doubt in description.doubts if doubt.code == "unused" and found]
@@ -194,7 +185,7 @@ def _more_plausible(chosen: Sampled | None, prominent: Sampled | None) -> Sample
     both = np.isfinite(one + other)
     if both.any() and np.mean(one[both] != other[both]) > 0.5:
         prominent = prominent._replace(hips=None)
-    return min(chosen, prominent, key=lambda flight: score(flight, scene_of(flight)).total)
+    return min(chosen, prominent, key=lambda flight: score(scene_of(flight)).total)
 
 
 def diagnose(
@@ -217,7 +208,7 @@ def diagnose(
     trial = Trial(flight, scene_of(flight))
     if not np.isfinite(trial.described.rays).any():
         return []
-    found = score(flight, trial.described)
+    found = score(trial.described)
     # A turned world leaves rays and bodies as they are; rolled cameras mirror the body.
     mirrored = any(found.odd[name].sigmas >= _STRANGE for name in ("face", "bend") if name in found.odd)
     fits = found.misfit < _MISSED and found.scatter < _MEETING and not mirrored
@@ -243,7 +234,7 @@ def diagnose(
     causes, gained = _causes(objective, [each for each in tried if each is not None], odd)
     if not causes or causes[0].alternative.code not in ("axes", "convention"):  # which turn the world, too
         level = alternatives.level(trial, solve(trial.described).joints) if fits else ()
-        causes = [Tried(each) for each in level] or causes or _below_zero(objective)
+        causes = [Tried(each) for each in level] or causes
     if is_strained and not _is_explained(causes):
         causes = _of_looks(trial, looks or {}) or causes
     codes = [cause.alternative.code for cause in causes if cause.score]
@@ -259,7 +250,8 @@ def diagnose(
 
 def _is_strange(described: Score) -> bool:
     """Test if a single unusual measure is a doubt at any total."""
-    limits = {"size": _STRANGE_SIZE, "unposed": np.inf}  # a log may end early
+    # A log may end early, or begin high above the ground.
+    limits = {"size": _STRANGE_SIZE, "unposed": np.inf, "below": np.inf}
     return any(each.sigmas >= limits.get(name, _STRANGE) for name, each in described.odd.items())
 
 
@@ -317,8 +309,8 @@ class Objective:
         self._pictures = np.isfinite(trial.described.rays[..., 0]).any(axis=-1).sum(axis=1)  # [C]
         self.described = self._fit(trial.described)
 
-    def _fit(self, scene: SceneOfMoments, flight: Sampled | None = None) -> Fit:
-        return fit(flight or self.trial.flight, lambda _: scene)
+    def _fit(self, scene: SceneOfMoments, beside: Fit | None = None) -> Fit:
+        return fit(lambda _: scene, beside=beside)
 
     def scored(self, alternative: Alternative, cost: float = np.inf) -> Tried:
         """Score an alternative."""
@@ -327,8 +319,7 @@ class Objective:
         least = _LEAST_GAIN_OF_TIMES if alternative.code in TIMES else -_SPARE
         limit = min(self.best_total + _SPARE, self.base.total - least)
         same = alternative.same_scatter
-        flight = alternative.flight or self.trial.flight
-        found = score(flight, alternative.scene, self.base, same_scatter=same, limit=limit)
+        found = score(alternative.scene, self.base, same_scatter=same, limit=limit)
         tried = Tried(alternative, found, cost)
         self.best_total = min(self.best_total, tried.total)
         return tried
@@ -368,7 +359,7 @@ class Objective:
             return float(np.median(chi2)) if chi2.size else np.inf
 
         start = min(free.starts, key=misfit) if len(free.starts) > 1 else free.starts[0]
-        found = fit(self.trial.flight, free.make, start, [_LOOSE] * len(start))
+        found = fit(free.make, start)
         if not np.isfinite(found.cost):
             return None  # too few joints are seen by two cameras
         alternative = free.alternative(found.numbers, found.covariance)
@@ -404,7 +395,7 @@ class Objective:
         if not kept.any():
             return np.inf
         rays = np.where(kept[..., None, None], described.rays, np.nan)
-        return self._fit(replace(described, rays=rays)).cost * float(seen.sum() / kept.sum())
+        return self._fit(replace(described, rays=rays), self.described).cost * float(seen.sum() / kept.sum())
 
     def compared(self, tried: Tried) -> Tried:
         """Compare an alternative and its price with the description.
@@ -414,28 +405,35 @@ class Objective:
         other errors: whichever saves less counts. Larger errors excuse everything: of them only the chi^2
         counts.
         """
-        scene, described = tried.alternative.scene, self.trial.described
+        alternative, scene, described = tried.alternative, tried.alternative.scene, self.described
         if scene is None or tried.score is None:
             return tried
-        before, total = self.described.cost, self.base.total
-        if tried.alternative.code in (*TIMES, "videos_swapped"):
-            same = self._at_moments_of(scene)
-            before = min(self._fit(same).cost, self._cost_of_pictures(scene))
-            total = min(total, score(self.trial.flight, same, self.base).total)
-        cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, tried.alternative.flight).cost
-        if tried.alternative.same_pictures is not None:
-            of_poses, flight = tried.alternative.same_pictures()
-            saved = self._fit(self._at_moments_of(of_poses)).cost - self._fit(of_poses, flight).cost
+        is_time, of_one = alternative.code in TIMES, alternative.same_pictures is None
+        beside = described if is_time else None
+        cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, beside).cost
+        found = self._told(tried, self.base.total, described.cost, cost)
+        if not (is_time or alternative.code == "videos_swapped") or found.gain < _MARGIN:
+            return found
+        same = self._at_moments_of(scene)
+        before = min(self._fit(same, described).cost, self._cost_of_pictures(scene))
+        total = min(self.base.total, score(same, self.base).total)
+        if alternative.same_pictures is not None:
+            of_poses = alternative.same_pictures()
+            saved = self._fit(self._at_moments_of(of_poses), beside).cost - self._fit(of_poses, beside).cost
             cost = max(cost, before - saved) if np.isfinite(saved) else np.inf
-        if tried.alternative.code in TIMES:
-            others = [self.trial.names.index(name) for name in tried.alternative.cameras]
-            # Few rates of one camera are tried, and its rays must go on meeting those of the others.
-            one_rate = tried.alternative.code == "frame_rate" and tried.alternative.same_pictures is None
+        if is_time:
+            others = [self.trial.names.index(name) for name in alternative.cameras]
             deviation = before * float(np.sqrt(2 * self._pictures[others].sum()) / self._pictures.sum())
-            chance = (1.0 if one_rate else _MOST_BY_CHANCE) * deviation
+            # Few rates of one camera are tried, and its rays must go on meeting those of the others.
+            chance = deviation if of_one and alternative.code == "frame_rate" else _MOST_BY_CHANCE * deviation
             cost = before + float(np.sign(cost - before)) * max(0.0, abs(cost - before) - chance)
+        return self._told(tried, total, before, cost)
+
+    def _told(self, tried: Tried, total: float, before: float, cost: float) -> Tried:
+        """Put the objective beside an alternative: of the description, by score and chi^2, and of itself."""
         scores = (0.0, 0.0) if tried.alternative.price == np.inf else (total, tried.total)
-        rays = (self._rays(before, described), self._rays(cost, scene))
+        described = self._rays(before, self.trial.described)
+        rays = described, self._rays(cost, tried.alternative.scene or self.trial.described)
         return tried._replace(before=(scores[0], rays[0]), after=(scores[1], rays[1]))
 
 
@@ -453,7 +451,7 @@ def _causes(objective: Objective, tried: Sequence[Tried], odd: bool) -> tuple[li
     for each in weighed:
         if causes and each.gain < causes[0].gain - _ALIKE:
             break
-        if _leaves_no_doubt(objective.trial.flight, each.alternative):
+        if _leaves_no_doubt(each.alternative):
             causes.append(each)
     simplest: dict[str, Tried] = {}
     for each in sorted(causes, key=lambda each: each.numbers):
@@ -475,7 +473,7 @@ def _of_either(trial: Trial, cause: Tried, known: Sequence[Tried]) -> Alternativ
         return own
     beside = own.code == "origin" and trial.is_loose_pair
     alike = (
-        _leaves_no_doubt(trial.flight, each.alternative)
+        _leaves_no_doubt(each.alternative)
         for each in known
         if (each.alternative.code, each.alternative.cameras) == (own.code, other)
         and cause.gain - each.gain < _MARGIN
@@ -486,7 +484,7 @@ def _of_either(trial: Trial, cause: Tried, known: Sequence[Tried]) -> Alternativ
     return replace(own, cameras=trial.names, what=what, remedy=own.remedy if beside else "")
 
 
-def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
+def _leaves_no_doubt(alternative: Alternative) -> bool:
     """Test if the flight would not be doubted as the alternative has it.
 
     It may explain the rays and still leave a flight that cannot be right, for example one in which all
@@ -494,27 +492,10 @@ def _leaves_no_doubt(flight: Sampled, alternative: Alternative) -> bool:
     """
     if alternative.scene is None:
         return True
-    found = score(alternative.flight or flight, alternative.scene)
+    found = score(alternative.scene)
     meets = found.misfit < _LEFT_MISFIT and found.scatter < _MEETING
     # Larger errors of poses are no cause that mends the rays.
     return found.total < _DOUBTFUL and (meets or alternative.price == np.inf) and not _is_strange(found)
-
-
-def _below_zero(objective: Objective) -> list[Tried]:
-    """Doubt drones that fly below zero all the time, where neither a map nor an actor says how high zero is.
-
-    Where all fly about equally high, the rays are alike with z upwards and downwards: no gain is asked for.
-    """
-    trial, place = objective.trial, objective.trial.described.position
-    height = place[trial.moving, :, 2]
-    if trial.located or not np.isfinite(height).any() or np.nanmax(height) > -_BELOW_M:
-        return []
-    what = "all drones fly below zero: their positions count z downwards, or zero is high above the ground"
-    remedy = trial.lines(trial.moving, remedies.pose, remedies.upside_down)
-    above = place * [1.0, 1.0, -1.0]
-    below = trial.posed("axes", what, remedy, (None, PRICE_OF_ALL), trial.described.rotation, above)
-    turned = objective.scored(below)
-    return [turned] if turned.total <= objective.base.total + _ALIKE + PRICE_OF_ALL else []
 
 
 # --- what is seen without a scene -------------------------------------------------------------------------
@@ -571,18 +552,14 @@ def _of_looks(trial: Trial, looks: Mapping[int, Callable[[], tuple[float, float]
 def _of_logs(objective: Objective) -> list[Tried]:
     """Find cameras that fly the same path, or start at the same place: no picture is needed for that.
 
-    Pictures tell where the logs have their zeros. Drones that hover together may also be apart in another
-    unit: then the zeros have to explain more.
+    Pictures tell where the logs have their zeros.
     """
     found, trial = [], objective.trial
     for doubt in doubts_of_logs({each.name: (each.entry, each.camera.trajectory) for each in trial.cameras}):
         seen = Tried(Alternative(doubt.code, tuple(doubt.cameras), doubt.what, doubt.remedy, 0.0))
         if doubt.code == "origin":
             placed = objective.with_numbers(alternatives.own_origins(trial, tuple(doubt.cameras), doubt.what))
-            apart_m = doubt.evidence["apart_m"]
-            hover = isinstance(apart_m, float) and apart_m < _HOVERING_M
-            if placed is not None:
-                seen = placed if hover else Tried(placed.alternative)
+            seen = seen if placed is None else Tried(placed.alternative)
         found.append(seen)
     return found
 

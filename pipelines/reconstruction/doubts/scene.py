@@ -51,8 +51,13 @@ _CHOSEN_SHARE = 0.5
 
 @dataclass(frozen=True)
 class SceneOfMoments:
-    """View of C cameras at T moments."""
+    """View of C cameras at T moments, and what else is logged of these."""
 
+    t_ns: Int64  # [T] moments; those of a pair follow each other in `first` and `second`
+    first: Int64  # [T / 2] index of the first moment of each pair
+    second: Int64  # [T / 2]
+    hips: Float | None  # [T, 3] m, logged; None without a logged actor
+    ground: GroundOfMap | None
     rays: Float  # [C, T, J, 2] normalised image coordinates; NaN where nothing was seen
     position: Float  # [C, T, 3] m
     rotation: Float  # [C, T, 3, 3] world_from_camera
@@ -68,10 +73,10 @@ class Sampled(NamedTuple):
 
     cameras: tuple[Filmed, ...]
     between: Interpolation
-    t_ns: Int64  # [T] moments; those of a pair follow each other in `first` and `second`
-    first: Int64  # [T / 2] index of the first moment of each pair
-    second: Int64  # [T / 2]
-    hips: Float | None  # [T, 3] m, logged; None without a logged actor
+    t_ns: Int64  # as of a scene, and what follows
+    first: Int64
+    second: Int64
+    hips: Float | None
     ground: GroundOfMap | None
     actor: LoggedActor | None = None
     truth_m: float | None = None  # stature of the true joints, if there are any
@@ -81,13 +86,6 @@ class Sampled(NamedTuple):
         first_ns = self.cameras[0].entry.frames.first_t_ns
         t_ns = first_ns + np.rint((self.t_ns - first_ns) * slower + late_s * 1e9).astype(np.int64)
         return self._replace(t_ns=t_ns, hips=None if self.actor is None else self.actor.hips_at(t_ns))
-
-    def scaled(self, factor: float) -> Sampled:
-        """Scale the logged actor and the map."""
-        ground, hips = self.ground, self.hips
-        if ground is not None:
-            ground = GroundOfMap(factor * ground.corner, factor * ground.side_m, factor * ground.height)
-        return self._replace(hips=None if hips is None else factor * hips, ground=ground)
 
 
 class GroundOfMap(NamedTuple):
@@ -114,6 +112,10 @@ class GroundOfMap(NamedTuple):
             inside = np.all((cell >= 0) & (cell < self.height.shape), axis=1)
         index = np.where(inside[:, None], cell, 0).astype(np.intp)
         return np.where(inside, self.height[index[:, 0], index[:, 1]], np.nan)
+
+    def scaled(self, factor: float) -> GroundOfMap:
+        """Scale the map."""
+        return GroundOfMap(factor * self.corner, factor * self.side_m, factor * self.height)
 
     def about(self, points: Float) -> tuple[Float, Float]:
         """Return the ground's height [N] under points [N, 3], NaN beside the map, and its error [N]."""
@@ -273,7 +275,9 @@ def scene_of(
     )
     focal_px = np.array([(camera.intrinsics.fx + camera.intrinsics.fy) / 2 for camera in cameras])
     sigma, height_px = np.array([camera.sigma for camera in cameras]), np.nan_to_num(np.array(person_px))
-    return SceneOfMoments(rays, position, rotation, focal_px, sigma, height_px, np.array(unposed), stated_ns)
+    known = (flight.t_ns, flight.first, flight.second, flight.hips, flight.ground)
+    of_cameras = (focal_px, sigma, height_px, np.array(unposed), stated_ns)
+    return SceneOfMoments(*known, rays, position, rotation, *of_cameras)
 
 
 def median(values: Float) -> float:
@@ -486,41 +490,41 @@ class Body:
         known = [each[np.isfinite(each)] for each in along]
         return min((float((each > 0).mean()) for each in known if each.size > _FEWEST_MOMENTS), default=1.0)
 
-    def motion(self, flight: Sampled, stature: float, white_m: float, keypoint_m: float) -> dict[str, Oddity]:
+    def motion(
+        self, scene: SceneOfMoments, stature: float, white_m: float, keypoint_m: float
+    ) -> dict[str, Oddity]:
         """Measure how oddly the person moves: not forwards, faster than people, or on feet that slide.
 
         Args:
-            flight: the flight.
+            scene: the scene of the moments.
             stature: m.
             white_m: by how much pose errors that are new in every pose move the person.
             keypoint_m: by how much keypoints' errors move a joint.
         """
         step_s = _STEP_NS / 1e9
         noise = np.sqrt(2) * white_m / step_s  # m/s
-        moved = (self.hips[flight.second] - self.hips[flight.first])[:, :2]
+        moved = (self.hips[scene.second] - self.hips[scene.first])[:, :2]
         pace = np.linalg.norm(moved, axis=-1) / step_s
         of_foot = float(np.hypot(noise, np.sqrt(2) * keypoint_m / step_s))
-        feet = [
-            self[name][flight.second] - self[name][flight.first] for name in ("left_ankle", "right_ankle")
-        ]
+        feet = [self[name][scene.second] - self[name][scene.first] for name in ("left_ankle", "right_ankle")]
         slid = median(np.minimum(*(np.linalg.norm(foot, axis=-1) / step_s for foot in feet)))
         slides = max(0.0, slid - 0.4 * stature / 1.7 - of_foot) / (0.5 + of_foot / 2)
-        fast, ahead = quantile(pace, 0.75), self._ahead(flight, white_m)
+        fast, ahead = quantile(pace, 0.75), self._ahead(scene, white_m)
         return {
             "course": Oddity(max(0.0, 0.5 - ahead) / 0.15, {"course_cosine": ahead}),
             "speed": Oddity(max(0.0, fast - 4.0 - 1.5 * noise) / (2 + noise), {"pace_mps": fast}),
             "slide": Oddity(slides, {"foot_mps": slid}),
-            "tread": self._tread(flight, stature, of_foot, feet),
+            "tread": self._tread(scene, stature, of_foot, feet),
         }
 
-    def _tread(self, flight: Sampled, stature: float, noise_mps: float, feet: list[Float]) -> Oddity:
+    def _tread(self, scene: SceneOfMoments, stature: float, noise_mps: float, feet: list[Float]) -> Oddity:
         """Compare how fast the standing foot is left behind with how fast the person walks.
 
         The steps of `feet` [T, 3] m are those of a pair of moments. A foot stands still, so both are alike in
         a world of any scale, but not with a wrong focal length, or at a wrong rate of pictures. Where moments
         are too far apart to tell the way, nothing is odd.
         """
-        t_ns, first, second = flight.t_ns, flight.first, flight.second
+        t_ns, first, second = scene.t_ns, scene.first, scene.second
         before = np.searchsorted(t_ns, t_ns[first] - _TREAD_NS)
         after = np.searchsorted(t_ns, t_ns[second] + _TREAD_NS, side="right") - 1
         way = (self.hips[after] - self.hips[before])[:, :2]
@@ -537,11 +541,11 @@ class Body:
         off = abs(np.log(max(share, 0.01) / usual))
         return Oddity(min(max(0.0, off - 0.15) / sigma, _MOST_TREAD), {"legs_over_pace": share})
 
-    def _ahead(self, flight: Sampled, white_m: float) -> float:
+    def _ahead(self, scene: SceneOfMoments, white_m: float) -> float:
         """Return the cosine of where the person walks against where they face; 1 if they hardly walk."""
-        first = np.arange(len(flight.t_ns))
-        second = np.searchsorted(flight.t_ns, flight.t_ns + _WALK_NS, side="right") - 1
-        step_s = (flight.t_ns[second] - flight.t_ns[first]) / 1e9
+        first = np.arange(len(scene.t_ns))
+        second = np.searchsorted(scene.t_ns, scene.t_ns + _WALK_NS, side="right") - 1
+        step_s = (scene.t_ns[second] - scene.t_ns[first]) / 1e9
         forwards = unit((self.forwards[first] + self.forwards[second])[:, :2])
         moved = (self.hips[second] - self.hips[first])[:, :2]
         along = _dot(moved, forwards)

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64, known_median
 from pipelines.geometry.compilation import cached, helper
-from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.geometry.poses import cross_matrix, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.geometry.triangulation import MIN_PARALLAX_DEG
 from pipelines.reconstruction.doubts.scene import (
     FEW,
@@ -27,7 +27,6 @@ from pipelines.reconstruction.doubts.scene import (
     SIZE_SIGMA,
     Body,
     Oddity,
-    Sampled,
     SceneOfMoments,
     median,
     quantile,
@@ -50,6 +49,8 @@ _STEPS = 20
 # A step that changes the chi^2 by less is the last.
 _CONVERGED = 0.05
 _LEAST_SIGMA = (0.02, np.radians(0.1))  # of constant errors, m and rad
+# Numbers that nothing shows stay within this, in m, rad or logarithms.
+_LOOSE = 30.0
 # Derivatives are taken over this step of m, rad and logarithms.
 _PROBE = 1e-4
 # Residuals beyond this many standard deviations count linearly.
@@ -106,12 +107,7 @@ def _inverse(matrix: Float) -> Float:
         for k in range(3):
             j, m, n, o = (i + 1) % 3, (i + 2) % 3, (k + 1) % 3, (k + 2) % 3
             inverse[i, k] = matrix[j, n] * matrix[m, o] - matrix[j, o] * matrix[m, n]
-    determinant = 0.0
-    for k in range(3):
-        determinant += matrix[0, k] * inverse[0, k]
-    for i in range(3):
-        for k in range(3):
-            inverse[i, k] /= determinant
+    inverse /= (matrix[0] * inverse[0]).sum()
     return inverse
 
 
@@ -168,28 +164,28 @@ class Fit:
     cost: float  # chi^2
     strain: float  # the part of it that is of constant errors, the logged actor and the person's stature
     scene: SceneOfMoments  # of the numbers; the constant errors stay in it
+    errors: Float  # [C, 6] m and rad
     covariance: Float  # [n, n] of the numbers: what the constant errors leave of it; without, of all errors
 
 
-def fit(flight: Sampled, make: Make, start: Float | None = None, loose: Sequence[float] = ()) -> Fit:
+def fit(make: Make, start: Sequence[float] | Float = (), beside: Fit | None = None) -> Fit:
     """Fit the numbers of an alternative, and the constant errors of all poses, by Gauss-Newton.
 
     Args:
-        flight: the flight.
         make: the scene of given numbers.
         start: the numbers [n] at which the search begins; by default there are none.
-        loose: their standard deviations [n]; infinite where nothing is known.
+        beside: the fit of a scene that differs little, whose constant errors the search begins with.
     """
-    numbers = np.zeros(0) if start is None else start
+    numbers = np.array(start, dtype=np.float64)
     scene = make(numbers)
-    errors = np.zeros((len(scene.focal_px), 6))
-    best, last = Fit(numbers, np.inf, np.inf, scene, np.zeros((0, 0))), np.inf
+    errors = np.zeros((len(scene.focal_px), 6)) if beside is None else beside.errors
+    best, last = Fit(numbers, np.inf, np.inf, scene, errors, np.zeros((0, 0))), np.inf
     for _ in range(_STEPS):
-        cost, strain, change, covariance = _step(flight, make, numbers, errors, loose)
+        cost, strain, change, covariance = _step(make, numbers, errors)
         settled = abs(cost - last) < _CONVERGED
         last = cost
         if cost < best.cost:
-            best = Fit(numbers, cost, strain, make(numbers), covariance)
+            best = Fit(numbers, cost, strain, make(numbers), errors, covariance)
         if settled or not np.isfinite(cost) or cost > 4 * best.cost + 100:
             break
         errors = errors + change[: errors.size].reshape(errors.shape)
@@ -210,91 +206,8 @@ def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Fl
     return (toward - along[..., None] * direction) / far[..., None], far
 
 
-@cached
-def _linear(
-    joints: Float,
-    position: Float,
-    direction: Float,
-    root: Float,
-    kept: Float,
-    numbers: Float,
-    placed: Float,
-    pull: Float,
-) -> tuple[Float, Float, Float]:
-    """Linearise the misses of rays, and solve for the joints.
-
-    Misses shrink with distance, and so do the parts of their standard deviations that come from places.
-
-    Args:
-        joints: [T, J, 3].
-        position: [C, T, 3] of the cameras.
-        direction: [C, T, J, 3] unit rays.
-        root: [C, T, J] roots of weights.
-        kept: [C, T, J] share of a miss's variance that does not shrink.
-        numbers: [C, T, J, 3, n + 1] derivatives of the misses by the n numbers, and the misses.
-        placed: [T, J] weights of known places.
-        pull: [T, J, 3] towards these.
-
-    Return weighted derivatives [C, 3 T J, 6 + n + 1] by each camera's shift and turn, by the numbers, and the
-    misses; those by the joints times these [3 T J, 6 C + n + 1]; and this with the joints solved.
-    """
-    cameras, times, names = root.shape
-    count = numbers.shape[4]
-    width = 6 * cameras + count
-    rows = np.zeros((cameras, 3 * times * names, 6 + count))
-    both, solution = np.zeros((3 * times * names, width)), np.zeros((3 * times * names, width))
-    matrix, toward = np.empty((3, 3)), np.empty(3)
-    for at in range(times * names):
-        t, j, first = at // names, at % names, 3 * at
-        for i in range(3):
-            for k in range(3):
-                matrix[i, k] = 0.0
-            matrix[i, i] = placed[t, j] + _FIRM
-            both[first + i, width - 1] = -pull[t, j, i]
-        for c in range(cameras):
-            weight = root[c, t, j]
-            if weight == 0.0:
-                continue
-            ray, along = direction[c, t, j], 0.0
-            for i in range(3):
-                toward[i] = joints[t, j, i] - position[c, t, i]
-                along += toward[i] * ray[i]
-            far = max(abs(along), _NEAR_M)
-            farther = np.sign(along) * kept[c, t, j] if abs(along) > _NEAR_M else 0.0
-            for i in range(3):
-                row = rows[c, first + i]
-                leaning = ray[i] + farther * numbers[c, t, j, i, count - 1]
-                for k in range(3):
-                    row[k] = weight * (leaning * ray[k] - (i == k)) / far
-                    # The ray turns about axis k, by the product of that with the ray.
-                    one, other = (k + 1) % 3, (k + 2) % 3
-                    turned = (i == other) * ray[one] - (i == one) * ray[other]
-                    nearer = ray[one] * toward[other] - ray[other] * toward[one]
-                    row[3 + k] = -weight * (along * turned + leaning * nearer) / far
-                for k in range(count):
-                    row[6 + k] = weight * numbers[c, t, j, i, k]
-            # A joint moves as the camera does, the other way.
-            for m in range(3):
-                row = rows[c, first + m]
-                for i in range(3):
-                    for k in range(3):
-                        matrix[i, k] += row[i] * row[k]
-                    for k in range(6):
-                        both[first + i, 6 * c + k] -= row[i] * row[k]
-                    for k in range(count):
-                        both[first + i, 6 * cameras + k] -= row[i] * row[6 + k]
-        inverse = _inverse(matrix)
-        for i in range(3):
-            for m in range(3):
-                for k in range(width):
-                    solution[first + i, k] += inverse[i, m] * both[first + m, k]
-    return rows, both, solution
-
-
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
-def _step(
-    flight: Sampled, make: Make, numbers: Float, errors: Float, loose: Sequence[float]
-) -> tuple[float, float, Float, Float]:
+def _step(make: Make, numbers: Float, errors: Float) -> tuple[float, float, Float, Float]:
     """Return cost and strain, the changes of constant errors [C, 6] and numbers [n], and a covariance."""
     scene = _with_errors(make(numbers), errors)
     solved = solve(scene)
@@ -315,7 +228,7 @@ def _step(
     huber = np.where(sigmas > _HUBER, _HUBER * (2 * sigmas - _HUBER), sigmas**2)
     level = np.sqrt(np.maximum(scene.sigma[:, :2] ** 2 - scene.sigma[:, 4:] ** 2, 0.0))
     sigma = np.repeat(np.maximum(level, _LEAST_SIGMA), 3, axis=1)
-    placed, pull, extra = _placed(flight, solved)
+    placed, pull, extra = _placed(scene, solved)
     sized = size_sigmas(solved.joints)
     strain = float(((errors / sigma) ** 2).sum()) + extra + sized**2
     cost = float((np.where(used, huber, 0.0) / seen).sum()) + strain
@@ -328,13 +241,23 @@ def _step(
         moved, away = _misses(joints, np.nan_to_num(probed.position), ray)
         moved *= np.sqrt(variance / (turned2 + moved2 / away**2))[..., None]
         parts.append((moved - missed) / _PROBE)
-    by_numbers = np.stack([*parts, missed], axis=-1)
-    rows, both, solution = _linear(
-        joints, place, solved.direction, np.sqrt(weight), turned2 / variance, by_numbers, placed, pull
-    )
-    # Each camera has its own errors; the numbers are shared by all.
-    equations = -both.T @ solution
-    for camera, own in enumerate(rows):
+    # Misses shrink with distance, and so do the parts of their standard deviations that come from places. A
+    # camera that turns moves joints the other way about itself, and the misses with it.
+    shrinks = np.where(far > _NEAR_M, np.sign(solved.depth) * turned2 / variance, 0.0)
+    leaning = solved.direction + shrinks[..., None] * missed
+    by_joint = (np.eye(3) - leaning[..., :, None] * solved.direction[..., None, :]) / far[..., None, None]
+    by_turn = by_joint @ cross_matrix(joints - place[:, :, None]) - cross_matrix(missed)
+    root = np.sqrt(weight)[..., None, None]
+    by_joint *= root
+    rows = np.concatenate([-by_joint, root * by_turn, root * np.stack([*parts, missed], axis=-1)], axis=-1)
+    # The joints are solved for. Each camera has its own errors; the numbers are shared by all.
+    matrix = (by_joint.mT @ by_joint).sum(axis=0) + (placed + _FIRM)[..., None, None] * np.eye(3)
+    right = by_joint.mT @ rows
+    both = np.concatenate([*right[..., :6], right[..., 6:].sum(axis=0)], axis=-1)
+    both[..., -1] -= pull
+    solution = np.linalg.solve(matrix, both).reshape(-1, unknowns + 1)
+    equations = -both.reshape(-1, unknowns + 1).T @ solution
+    for camera, own in enumerate(rows.reshape(len(rows), -1, rows.shape[-1])):
         place_of = np.r_[6 * camera : 6 * camera + 6, errors.size : unknowns + 1]
         equations[np.ix_(place_of, place_of)] += own.T @ own
     # The person grows by what moves the joints away from their middle at each moment.
@@ -343,8 +266,7 @@ def _step(
     about = np.where(known, joints - middle, 0.0).ravel()
     of_size = -(about @ solution[:, :-1]) / (max(float(about @ about), 1e-9) * SIZE_SIGMA)
     normal, right = equations[:-1, :-1], equations[:-1, -1]
-    free = np.asarray(loose, dtype=np.float64)
-    inverse = np.concatenate([1 / sigma.ravel() ** 2, 1 / free**2])
+    inverse = np.concatenate([1 / sigma.ravel() ** 2, np.full(len(numbers), 1 / _LOOSE**2)])
     normal += np.diag(inverse + 1e-9) + np.outer(of_size, of_size)
     right += inverse * np.concatenate([errors.ravel(), numbers]) + of_size * sized
     covariance: Float = np.asarray(np.linalg.inv(normal), np.float64)
@@ -368,12 +290,12 @@ def _changing2(scene: SceneOfMoments) -> tuple[Float, Float]:
     return pixel_variance(scene) / scene.focal_px**2 + turned2, moved2
 
 
-def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]:
+def _placed(scene: SceneOfMoments, solved: SolvedJoints) -> tuple[Float, Float, float]:
     """Pull hips to the logged actor; return weights [T, J], pulls [T, J, 3] and the cost."""
     weight, pull = np.zeros(solved.views.shape), np.zeros(solved.joints.shape)
-    if flight.hips is None:
+    if scene.hips is None:
         return weight, pull, 0.0
-    apart = flight.hips[:, None] - solved.joints[:, HIPS]
+    apart = scene.hips[:, None] - solved.joints[:, HIPS]
     known = np.asarray(np.isfinite(apart).all(axis=-1))
     apart = np.where(known[..., None], apart, 0.0)
     # The way there counts besides the place: a log turned about its zero leads elsewhere.
@@ -386,12 +308,13 @@ def _placed(flight: Sampled, solved: SolvedJoints) -> tuple[Float, Float, float]
 
 # Score of a scene in which next to nothing is seen by two cameras.
 _IMPOSSIBLE = 99.0
-# Median of chi^2 over its degrees of freedom, by those; of more it is about 0.9.
-_CHI2_MEDIAN, _CHI2_MEDIAN_OF_MORE = {1: 0.455, 3: 0.789, 5: 0.870}, 0.9
 # A joint that is farther away does not tell how far stated errors move it.
 _FARTHEST_M = 30.0
 # Rays that cross by less than this sine tell no distance.
 _PARALLEL = 0.15
+# Where nothing says how high zero is, drones that all fly lower than this below it count heights downwards:
+# the rays may be alike with z upwards, so it is as odd as a margin of alternatives needs.
+_BELOW_M, _BELOW_SIGMAS = 1.0, 10.0
 # Ankles of somebody who stands are this high above the ground.
 _ANKLE_ABOVE_GROUND_M = 0.08
 # Rays that miss each other by more standard deviations cannot be used.
@@ -425,7 +348,6 @@ class Score(NamedTuple):
 
 @np.errstate(invalid="ignore", divide="ignore")
 def score(
-    flight: Sampled,
     scene: SceneOfMoments,
     base: Score | None = None,
     *,
@@ -435,7 +357,6 @@ def score(
     """Score a scene.
 
     Args:
-        flight: its flight.
         scene: the scene.
         base: the score of the scene as described; None if it is that.
         same_scatter: True where an alternative can only seem to change the scatter, as a unit does.
@@ -474,7 +395,7 @@ def score(
     apart_m = np.max([np.linalg.norm(one - other, axis=-1) for one, other in pairs], axis=0)
     loose = float(np.sqrt(2) * scene.sigma[:, 0].mean() / max(median(apart_m), 1e-9))  # share of the scale
     odd = body.proportions(stature, loose) | body.posture()
-    odd |= _place(flight, scene, body, solved, stature)
+    odd |= _place(scene, body, solved, stature)
     freedom, gate = 2 * solved.views[good] - 3, (_UNUSED_SIGMAS * max(misfit, 1.0)) ** 2
     unused = float((solved.chi2[good] > gate * freedom).mean())
     odd["unused"] = Oddity(max(0.0, unused - _USUALLY_UNUSED) / 0.05, {"unused_share": unused})
@@ -503,14 +424,12 @@ def unposed(scene: SceneOfMoments) -> Oddity:
 
 
 def _misfit(solved: SolvedJoints, good: Bool) -> float:
-    """Return the root of the median chi^2 over its freedom: 1 where all is as stated."""
-    freedom = 2 * solved.views - 3
-    total = 0.0
-    for value in np.unique(freedom[good]):
-        among = good & (freedom == value)
-        usual = _CHI2_MEDIAN.get(int(value), _CHI2_MEDIAN_OF_MORE)
-        total += among.sum() * median(solved.chi2[among]) / value / usual
-    return float(np.sqrt(total / good.sum()))
+    """Return the root of the median chi^2 over that of right rays: 1 where all is as stated.
+
+    The median of chi^2 with k degrees of freedom is k (1 - 2 / 9 k)^3 (Wilson and Hilferty 1931).
+    """
+    freedom = 2 * solved.views[good] - 3
+    return float(np.sqrt(median(solved.chi2[good] / (freedom * (1 - 2 / (9 * freedom)) ** 3))))
 
 
 def _best_sine(solved: SolvedJoints) -> float:
@@ -587,9 +506,7 @@ def _crossings(
     return used[:n], design[:n], apart[:n], noise2[:n]
 
 
-def _place(
-    flight: Sampled, scene: SceneOfMoments, body: Body, solved: SolvedJoints, stature: float
-) -> dict[str, Oddity]:
+def _place(scene: SceneOfMoments, body: Body, solved: SolvedJoints, stature: float) -> dict[str, Oddity]:
     """Measure how the person moves, and how far they are from under drones, the ground, the logged actor."""
     known = solved.seen & (solved.views >= 2)
     far = [median(np.abs(depth[used])) for depth, used in zip(solved.depth, known, strict=True)]
@@ -599,13 +516,17 @@ def _place(
     # The cameras that see a joint change, and with them the errors that they have in common.
     limp = float(np.nanmedian([_spread(length) for length, _ in body.lengths]))
     odd = {"limp": Oddity(limp / (0.10 + 0.5 * stated_m), {"limb_spread": limp})}
-    odd |= body.motion(flight, stature, white_m, keypoint_m)
-    if not all(camera.static for camera in flight.cameras):
+    odd |= body.motion(scene, stature, white_m, keypoint_m)
+    moves = np.isfinite(scene.unposed)
+    if moves.any():
         above_m = median(body.hips[:, 2]) - median(scene.position[..., 2])
         odd["above"] = Oddity(max(0.0, above_m) / 2.0, {"above_m": above_m})
-    if flight.ground is not None:
+        below_m = -float(np.nanmax(scene.position[moves, :, 2]))
+        if scene.hips is None and scene.ground is None and below_m > _BELOW_M:
+            odd["below"] = Oddity(_BELOW_SIGMAS, {"below_m": below_m})
+    if scene.ground is not None:
         foot = np.fmin(body["left_ankle"][:, 2], body["right_ankle"][:, 2])
-        under = flight.ground.under(body.hips)
+        under = scene.ground.under(body.hips)
         on_map = np.isfinite(under)
         share = float(on_map.sum() / max(np.isfinite(body.hips[:, 0]).sum(), 1))
         if share < 0.5:
@@ -620,8 +541,8 @@ def _place(
         walked_m = math.hypot(*(quantile(xy, 0.95) - quantile(xy, 0.05) for xy in body.hips[:, :2].T))
         excused_m = 0.5 + _SLOPE * walked_m + 3 * white_m
         odd["level"] = Oddity(max(0.0, rise_m - excused_m) / 0.3, {"rise_m": rise_m, "walked_m": walked_m})
-    if flight.hips is not None and np.isfinite(flight.hips[:, 0]).any():
-        apart = body.hips - flight.hips
+    if scene.hips is not None and np.isfinite(scene.hips[:, 0]).any():
+        apart = body.hips - scene.hips
         constant = np.array([median(apart[:, axis]) for axis in range(3)])
         apart_m = float(np.linalg.norm(constant))
         path_m = median(np.linalg.norm(apart - constant, axis=-1))

@@ -44,6 +44,9 @@ _USUAL_SHARE = 0.9
 # Logs that leave a larger share of the turning unexplained tell no time.
 _UNEXPLAINED = 0.5
 
+RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
+"""Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
+
 LEAST_GAIN = 16.0
 """Least gain of chi^2 with which other times of pictures are accepted."""
 
@@ -123,21 +126,15 @@ def _angles(rotation: Float) -> Float:
 
 
 def lateness(
-    cameras: Sequence[Camera],
-    turns: Mapping[int, Turns],
-    between: Interpolation,
-    factors: Sequence[float],
-    first_ns: Sequence[int] | None = None,
+    cameras: Sequence[Camera], turns: Mapping[int, Turns], between: Interpolation, first_ns: Sequence[int]
 ) -> list[Lateness]:
     """Find the clocks and frame rates, of all cameras and of each, by which the turns fit best; best first.
 
-    Turns are by camera; `factors` of the times between pictures are tried, from `first_ns` on (by default the
-    first picture that was looked at). None is returned if too little turns, or the logs turn otherwise at all
-    times.
+    Turns are by camera; other rates count from the cameras' first pictures at `first_ns`. None is returned if
+    too little turns, or the logs turn otherwise at all times.
     """
-    starts = [int(each.frame_t_ns[0]) for each in cameras] if first_ns is None else first_ns
-    times = [*((float(s), 1.0) for s in _GRID_S), *((0.0, factor) for factor in factors)]
-    curves = {i: _gains(cameras[i], found, between, times, start_ns=starts[i]) for i, found in turns.items()}
+    times = [*((float(s), 1.0) for s in _GRID_S), *((0.0, factor) for factor in RATES)]
+    curves = {i: _gains(cameras[i], found, between, times, first_ns[i]) for i, found in turns.items()}
     groups = [*((i,) for i in turns), *([tuple(turns)] if len(turns) == len(cameras) > 1 else [])]
     tried: list[Lateness] = []
     for group in groups:
@@ -146,7 +143,7 @@ def lateness(
         tried += [] if clock is None else [clock]
         tried += [
             Lateness(group, 0.0, factor, float(gain), float("nan"))
-            for factor, gain in zip(factors, _explained(rates), strict=True)
+            for factor, gain in zip(RATES, _explained(rates), strict=True)
             if np.isfinite(gain)
         ]
     return sorted(tried, key=lambda each: -each.gain)
@@ -186,7 +183,6 @@ def _gains(
     turns: Turns,
     between: Interpolation,
     times: Sequence[tuple[float, float]],
-    *,
     start_ns: int = 0,
 ) -> Float:
     """Return by how much other times lower the chi^2, the squares left, and those of turns [S, 3].
