@@ -125,10 +125,10 @@ def test_people_who_lie_or_turn_cartwheels_are_believed(tmp_path: Path, seed: in
     assert doubts_of(mistaken(Described(lying, tmp_path / lying.name), None)) == []
 
 
+ROLLED = of_mounts(turned("z", 180))
 CASES: dict[str, tuple[str, Change]] = {
     "videos": ("videos_swapped", swapped),
     "focal": ("intrinsics", of_cameras(focal(2.0))),
-    "rolled": ("mount", of_mounts(turned("z", 180))),
     "mirrored": ("mirrored", with_keypoints(mirrored)),
     "gimbal": ("gimbal", fixed_gimbal(-DOWN_DEG, "world")),
     "clock": ("clock", of_cameras(clock(0.1), "drone3")),
@@ -140,7 +140,7 @@ CASES: dict[str, tuple[str, Change]] = {
     "feet, one": ("unit", of_poses(lambda pose: (pose[0] / 0.3048, pose[1]), "drone1")),
 }
 WHOSE = {"clock": ["drone3"], "backwards": ["drone1"]}
-MENDED = ("videos", "rolled", "mirrored", "gimbal", "feet", "feet, one")
+MENDED = ("videos", "mirrored", "gimbal", "feet", "feet, one")
 
 
 @pytest.mark.parametrize("case", sorted(set(CASES) - set(MENDED)))
@@ -198,7 +198,7 @@ def test_the_mistake_is_named_and_its_remedy_makes_the_flight_right(flight: Desc
 
 
 def test_fix_writes_what_was_tried_and_keeps_comments(flight: Described) -> None:
-    manifest = mistaken(flight, CASES["rolled"][1])
+    manifest = mistaken(flight, ROLLED)
     commented = manifest.read_text().replace("cameras:", "# filmed on Monday\ncameras:  # three\n", 1)
     manifest.write_text(commented)
     found = json.loads(succeeds("check", manifest, "--fix", "--json"))
@@ -258,7 +258,7 @@ def test_a_session_of_before_has_no_doubts(flight: Described, tmp_path: Path) ->
 
 
 def test_reconstruct_states_doubts_and_check_refuses_them(flight: Described, tmp_path: Path) -> None:
-    manifest, session = mistaken(flight, CASES["rolled"][1]), tmp_path / "rolled.session"
+    manifest, session = mistaken(flight, ROLLED), tmp_path / "rolled.session"
     succeeds("ingest", manifest, "-o", session)
     metrics = json.loads(succeeds("reconstruct", session, "--method", "robust", "--json"))
     assert metrics["doubts"][0]["code"] == "mount"

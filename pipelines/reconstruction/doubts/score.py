@@ -206,6 +206,41 @@ def _misses(joints: Float, position: Float, direction: Float) -> tuple[Float, Fl
     return (toward - along[..., None] * direction) / far[..., None], far
 
 
+@cached
+def _solved_for_joints(rows: Float, placed: Float, pull: Float) -> tuple[Float, Float]:
+    """Solve for the joints, by whose places misses change as by the cameras' shifts, the other way.
+
+    `rows` [C, T, J, 3, 6 + n + 1] are weighted derivatives of misses by each camera's shift and turn, by n
+    numbers, and the misses; `placed` [T, J] are weights of known places, `pull` [T, J, 3] leads there. Return
+    the derivatives by joints times all of them [3 T J, 6 C + n + 1], and this with the joints solved.
+    """
+    cameras, times, names, _, own = rows.shape
+    others, matrix = 6 * cameras, np.empty((3, 3))
+    both = np.zeros((3 * times * names, others + own - 6))
+    solution = np.zeros(both.shape)
+    for at in range(times * names):
+        t, j, first = at // names, at % names, 3 * at
+        for i in range(3):
+            for k in range(3):
+                matrix[i, k] = 0.0
+            matrix[i, i] = placed[t, j] + _FIRM
+            both[first + i, -1] = -pull[t, j, i]
+        for c in range(cameras):
+            for m in range(3):
+                row = rows[c, t, j, m]
+                for i in range(3):
+                    for k in range(3):
+                        matrix[i, k] += row[i] * row[k]
+                    for k in range(own):
+                        both[first + i, 6 * c + k if k < 6 else others + k - 6] -= row[i] * row[k]
+        inverse = _inverse(matrix)
+        for i in range(3):
+            for m in range(3):
+                for k in range(others + own - 6):
+                    solution[first + i, k] += inverse[i, m] * both[first + m, k]
+    return both, solution
+
+
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _step(make: Make, numbers: Float, errors: Float) -> tuple[float, float, Float, Float]:
     """Return cost and strain, the changes of constant errors [C, 6] and numbers [n], and a covariance."""
@@ -247,16 +282,11 @@ def _step(make: Make, numbers: Float, errors: Float) -> tuple[float, float, Floa
     leaning = solved.direction + shrinks[..., None] * missed
     by_joint = (np.eye(3) - leaning[..., :, None] * solved.direction[..., None, :]) / far[..., None, None]
     by_turn = by_joint @ cross_matrix(joints - place[:, :, None]) - cross_matrix(missed)
-    root = np.sqrt(weight)[..., None, None]
-    by_joint *= root
-    rows = np.concatenate([-by_joint, root * by_turn, root * np.stack([*parts, missed], axis=-1)], axis=-1)
-    # The joints are solved for. Each camera has its own errors; the numbers are shared by all.
-    matrix = (by_joint.mT @ by_joint).sum(axis=0) + (placed + _FIRM)[..., None, None] * np.eye(3)
-    right = by_joint.mT @ rows
-    both = np.concatenate([*right[..., :6], right[..., 6:].sum(axis=0)], axis=-1)
-    both[..., -1] -= pull
-    solution = np.linalg.solve(matrix, both).reshape(-1, unknowns + 1)
-    equations = -both.reshape(-1, unknowns + 1).T @ solution
+    rows = np.concatenate([-by_joint, by_turn, np.stack([*parts, missed], axis=-1)], axis=-1)
+    rows *= np.sqrt(weight)[..., None, None]
+    both, solution = _solved_for_joints(rows, placed, pull)
+    # Each camera has its own errors; the numbers are shared by all.
+    equations = -both.T @ solution
     for camera, own in enumerate(rows.reshape(len(rows), -1, rows.shape[-1])):
         place_of = np.r_[6 * camera : 6 * camera + 6, errors.size : unknowns + 1]
         equations[np.ix_(place_of, place_of)] += own.T @ own
