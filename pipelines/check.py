@@ -14,6 +14,7 @@ from typing import Any
 from pipelines.detect import BACKGROUND, DETECT, cameras_to_detect, cameras_to_follow, detect, follow
 from pipelines.ingest import ingest
 from pipelines.reconstruct import chosen_detections, find_people
+from pipelines.reconstruction.background import turned_aside
 from pipelines.reconstruction.background_tracks import load_tracks
 from pipelines.reconstruction.doubts.diagnosis import doubts_of
 from pipelines.reconstruction.doubts.remedies import mended
@@ -126,6 +127,7 @@ def _checked(
         cameras,
         chosen=chosen_detections(cameras, found, association),
         followed={name: own for name, own in tracks.items() if own is not None},
+        aside=turned_aside,
         pose_noise=pose_noise,
     )
     alone = ["one camera: its poses were not compared with another view"] * (len(description.cameras) == 1)

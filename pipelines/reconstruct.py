@@ -39,6 +39,7 @@ from pipelines.keypoints.corrections import (
 from pipelines.reconstruction.background import (
     clocks_of_backgrounds,
     refine_cameras,
+    turned_aside,
     with_known_mount,
 )
 from pipelines.reconstruction.background_tracks import Followed, Stills, load_stills, load_tracks
@@ -433,6 +434,7 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
         cameras,
         chosen=chosen_detections(cameras, attempt.found, attempt.association),
         followed=flight.followed,
+        aside=turned_aside,
         pose_noise=flight.settings.pose_noise,
     )
     return [*doubts_of_clocks(flight.description, attempt.metrics.get("clocks_moved", {})), *doubts]

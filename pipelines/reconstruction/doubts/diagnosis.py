@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.reconstruction.background import turned_aside
 from pipelines.reconstruction.background_tracks import Followed
 from pipelines.reconstruction.doubts import alternatives, remedies
 from pipelines.reconstruction.doubts.alternatives import (
@@ -48,7 +47,7 @@ from pipelines.reconstruction.doubts.score import (
 from pipelines.reconstruction.doubts.turning import LEAST_GAIN, Lateness, all_turns, is_sure_clock, lateness
 from pipelines.reconstruction.loading import load_truth
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.description import Description, Doubt
+from pipelines.session.description import Description, Doubt, Interpolation
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
 
@@ -106,6 +105,7 @@ def doubts_of(
     *,
     chosen: Sequence[Int64],
     followed: Mapping[str, object],
+    aside: Callable[[Camera, Followed, Interpolation], tuple[float, float] | None],
     pose_noise: str | None = None,
 ) -> list[Doubt]:
     """Diagnose a session.
@@ -119,6 +119,7 @@ def doubts_of(
         cameras: with their detections.
         chosen: which detection [F] of each camera's pictures the actor is, -1 for none.
         followed: backgrounds of cameras by name; what is none is ignored.
+        aside: finds by how much a camera looks beside its log (`background.turned_aside`).
         pose_noise: the value of `--pose-noise`, if any.
 
     Raises:
@@ -144,7 +145,7 @@ def doubts_of(
         seen = followed.get(camera.name)
         # Attitudes by pictures are not compared with themselves.
         if isinstance(seen, Followed) and camera.entry.picture_map is None:
-            looks[index] = partial(turned_aside, camera.camera, seen, between)
+            looks[index] = partial(aside, camera.camera, seen, between)
     found = diagnose(flight, late, looks)
     # A gimbal that nothing uses, where it can be, explains more than any other change would.
     unused = [doubt for doubt in description.doubts if doubt.code == "unused" and found]
