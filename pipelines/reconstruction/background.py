@@ -799,10 +799,8 @@ class _Stretch:
     def _add_motion(self, position: Float, band: Float, force: Float) -> None:
         """Add that cameras at `position` [T, 3] accelerate little, to the normal equations of the poses."""
         before, after = np.diff(self._times_s())[:-1], np.diff(self._times_s())[1:]
-        share = (
-            np.stack([1 / before, -1 / before - 1 / after, 1 / after]) * 2 / (before + after)
-        )  # [3, T - 2]
-        share /= _ACCELERATION_MPS2
+        share = np.stack([1 / before, -1 / before - 1 / after, 1 / after])  # of three places, [3, T - 2]
+        share *= 2 / ((before + after) * _ACCELERATION_MPS2)
         count = len(before)
         excess = sum(share[k][:, None] * position[k : k + count] for k in range(3))
         for k, axis in product(range(3), range(3)):
@@ -816,9 +814,8 @@ class _Stretch:
         last = self.seen.picture[self.seen.first[1:] - 1]
         first = self.seen.picture[self.seen.first[:-1]]
         widest = (self.place[last] - self.place[first]).max(initial=0)
-        widest = max(
-            widest, np.diff(self.knot_place).max(initial=0), (self.place[2:] - self.place[:-2]).max(initial=0)
-        )
+        widest = max(widest, (self.place[2:] - self.place[:-2]).max(initial=0))
+        widest = max(widest, np.diff(self.knot_place).max(initial=0))
         before = np.abs(self.place - self.knot_place[self.knot]).max()
         after = np.abs(self.place - self.knot_place[self.knot + 1]).max()
         return int(max(widest, before, after)) + 6

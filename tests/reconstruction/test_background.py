@@ -227,6 +227,26 @@ def test_a_position_that_never_changes_was_surveyed_unless_pictures_show_that_it
     assert SURVEYED_M <= sigma < 1.1 * SURVEYED_M if surveyed else sigma >= UNKNOWN_SIGMA[0]
 
 
+def test_a_hovering_camera_does_not_follow_the_noise_of_its_log() -> None:
+    """Points that are lost before the camera moves could lie anywhere; then its noise would seem true."""
+    rng = np.random.default_rng(0)
+    t_s = np.arange(120) / 30
+    _, facing = flown(1, 0.0)
+    position = np.stack([np.maximum(t_s - 2.0, 0.0) ** 2, 0 * t_s, 0 * t_s + 3.0], axis=1)  # 2 m/s^2
+    rotation = np.tile(facing, (120, 1, 1))
+    picture, point, xy = sighted(position, rotation, rng, noise_px=0.15)
+    white = [White(position_m=0.05, rotation_deg=0.3)]
+    at, quaternion = disturb(
+        white, (1e9 * t_s).astype(np.int64), position, quaternion_from_matrix(rotation), rng
+    )
+    logged_poses = at, matrix_from_quaternion(quaternion)
+    found = adjusted(picture, 10 * point + picture // 30, xy, logged_poses, PosePrior.of(None))
+    # The mean of the log over the 30 pictures of a track errs by 0.05 m / sqrt(30) = 9 mm; three of them.
+    assert np.std(found.position - position, axis=0).max() < 3 * 0.05 / np.sqrt(30)
+    # The deviation of 360 numbers errs by 4 %; a few of them are spent on slow errors.
+    assert found.prior.white[0] == pytest.approx(0.05, rel=0.25)
+
+
 @pytest.mark.parametrize("pictures", [60, 150])
 def test_levels_that_nobody_stated_are_estimated(pictures: int) -> None:
     """Compare with the errors drawn: their standard deviations are known to 1 / sqrt(6 pictures).
