@@ -12,7 +12,6 @@ import sys
 import tempfile
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -35,25 +34,17 @@ _MEMORY_BYTES, _MEMORY_PER_BYTE = 1 << 29, 20
 _FILES = ("cameras", "images")
 
 
-@dataclass(frozen=True)
-class _Model:
-    """Layout of a camera model's parameters: one or two focal lengths, cx, cy, then coefficients."""
-
-    focals: int
-    distortion: DistortionModel
-    padded: int  # coefficients of our model; the missing ones are zero
-
-
-_MODELS = {
-    "SIMPLE_PINHOLE": _Model(1, "none", 0),
-    "PINHOLE": _Model(2, "none", 0),
-    "SIMPLE_RADIAL": _Model(1, "radtan", 4),
-    "RADIAL": _Model(1, "radtan", 4),
-    "OPENCV": _Model(2, "radtan", 4),
-    "FULL_OPENCV": _Model(2, "radtan", 8),
-    "OPENCV_FISHEYE": _Model(2, "fisheye", 4),
-    "SIMPLE_RADIAL_FISHEYE": _Model(1, "fisheye", 4),
-    "RADIAL_FISHEYE": _Model(1, "fisheye", 4),
+# Of each model: focal lengths, before cx, cy and coefficients; our model, and how many of those it has.
+_MODELS: dict[str, tuple[int, DistortionModel, int]] = {
+    "SIMPLE_PINHOLE": (1, "none", 0),
+    "PINHOLE": (2, "none", 0),
+    "SIMPLE_RADIAL": (1, "radtan", 4),
+    "RADIAL": (1, "radtan", 4),
+    "OPENCV": (2, "radtan", 4),
+    "FULL_OPENCV": (2, "radtan", 8),
+    "OPENCV_FISHEYE": (2, "fisheye", 4),
+    "SIMPLE_RADIAL_FISHEYE": (1, "fisheye", 4),
+    "RADIAL_FISHEYE": (1, "fisheye", 4),
 }
 
 
@@ -113,11 +104,11 @@ def _intrinsics(path: Path, camera: str, model: str, size: list[int], parameters
     if model not in _MODELS:
         problem = f"camera {camera} has the model {model}, which is not supported"
         raise DataError(path, problem, f"use one of {', '.join(_MODELS)}")
-    layout = _MODELS[model]
-    cx, cy, *coefficients = parameters[layout.focals :]
-    matrix = np.array([[parameters[0], 0, cx - 0.5], [0, parameters[layout.focals - 1], cy - 0.5], [0, 0, 1]])
-    padded = (*coefficients, *[0.0] * (layout.padded - len(coefficients)))
-    return build_intrinsics(path, camera, size, matrix, layout.distortion, padded)
+    focals, distortion, count = _MODELS[model]
+    cx, cy, *coefficients = parameters[focals:]
+    matrix = np.array([[parameters[0], 0, cx - 0.5], [0, parameters[focals - 1], cy - 0.5], [0, 0, 1]])
+    padded = (*coefficients, *[0.0] * (count - len(coefficients)))
+    return build_intrinsics(path, camera, size, matrix, distortion, padded)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
