@@ -3,7 +3,7 @@
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -23,24 +23,14 @@ KNOWN = tuple(_PIXELS)
 """Encodings of raw pictures that can be decoded."""
 
 
-class Stamped(Protocol):
+class Stamps(NamedTuple):
     """Stamps of a picture, without its pixels."""
 
-    @property
-    def stamp_ns(self) -> int:
-        """Stamp of its header; 0 without one."""
-
-    @property
-    def receive_ns(self) -> int:
-        """Stamp of its receipt."""
-
-
-class _Stamps(NamedTuple):
-    stamp_ns: int
+    stamp_ns: int  # of its header; 0 without one
     receive_ns: int
 
 
-_Stamped = TypeVar("_Stamped", bound=Stamped)
+Stamped = TypeVar("Stamped", PictureSample, Stamps)
 
 
 def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
@@ -54,10 +44,10 @@ def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int6
     return np.array(header_ns, np.int64), np.array(receive_ns, np.int64)
 
 
-def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:
+def later_pictures(pictures: Iterator[Stamped], stamps: str) -> Iterator[Stamped]:
     """Yield the pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
-    newest: _Stamped | None = None
-    leapt: _Stamped | None = None
+    newest: Stamped | None = None
+    leapt: Stamped | None = None
     for picture in pictures:
         if newest is not None:
             if stamp_of(picture, stamps) <= stamp_of(newest, stamps):
@@ -75,7 +65,7 @@ def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamp
 
 def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
     """Return the stamps of the `later_pictures`, [n], strictly increasing, by header (0: none) or receipt."""
-    pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
+    pictures = map(Stamps, header_ns.tolist(), receive_ns.tolist())
     return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
 
 
@@ -86,7 +76,7 @@ def _leap_ns(before: Stamped, after: Stamped) -> int:
     return (after.stamp_ns - before.stamp_ns) - (after.receive_ns - before.receive_ns)
 
 
-def stamp_of(picture: Stamped, stamps: str) -> int:
+def stamp_of(picture: PictureSample | Stamps, stamps: str) -> int:
     """Return the header stamp if it exists and is wanted, else the stamp of receipt."""
     return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
 
