@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.pictures import KNOWN, decode, is_known, later_pictures
@@ -20,15 +20,8 @@ from pipelines.session.stages import noted_stamps
 from pipelines.session.storage import file_stamp, is_folder, sha256_of
 from pipelines.session.urls import located
 
-
-class CameraPictures(AbstractContextManager["CameraPictures"], Protocol):
-    """Reader of pictures; a context manager."""
-
-    def read(self, number: int) -> Picture | None:
-        """Read one picture, BGR; None if it cannot be decoded."""
-
-    def __exit__(self, *exception: object) -> None:
-        """Close the files."""
+CameraPictures: TypeAlias = "VideoReader | FolderPictures | LoggedPictures"
+"""Readers of pictures by number, which are context managers."""
 
 
 @contextmanager
