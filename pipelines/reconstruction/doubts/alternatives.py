@@ -25,18 +25,16 @@ from pipelines.geometry.poses import (
 from pipelines.geometry.rig import between
 from pipelines.reconstruction.doubts import remedies
 from pipelines.reconstruction.doubts.scene import (
-    FEW,
     HIPS,
     JOINTS,
-    PLACED_M,
     SIZE_SIGMA,
     STATURE_M,
-    Body,
     Sampled,
     SceneOfMoments,
     scene_of,
     trunk_direction,
 )
+from pipelines.reconstruction.doubts.score import fit
 from pipelines.reconstruction.observations import Filmed
 from pipelines.reconstruction.solving import NOSE_TO_ANKLES
 from pipelines.session.people import mirrored
@@ -292,20 +290,27 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     yield Alternative("level", trial.names, what, remedy, 0.0, evidence=evidence)
 
 
-def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterator[Alternative]:
+def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]:
     """Scale all positions so that the person has a usual stature: rays that fit go on fitting.
 
     What else is placed in the world, as a map or an actor, is scaled with them, or is right as it is. The
     truth, if there is one, says which line changes no more than is wrong.
     """
-    flight, described = trial.flight, trial.described
-    # Any scale makes the person as tall as people are: that much surer the stature makes it.
-    price = PRICE_OF_ALL + np.log(1 / SIZE_SIGMA) / 2 + dearer
-    size = STATURE_M / stature
-    by_actor, sigma = _scaled_to_actor(trial, joints, size)
+    flight, described, size = trial.flight, trial.described, STATURE_M / stature
+
+    def scaled(numbers: Float) -> SceneOfMoments:
+        # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
+        place, sigma = described.position.copy(), described.sigma.copy()
+        place *= np.exp(numbers[0])
+        sigma[:, ::2] *= np.exp(numbers[0])
+        return replace(described, position=place, sigma=sigma)
+
+    # The stature and a logged actor show it.
+    found = fit(scaled, np.log([size]))
+    sigma = float(np.sqrt(found.covariance[0, 0]))
     # Units are far apart, so nearly all statures tell them.
     near = max(2 * sigma, SIZE_SIGMA)
-    unit = next((name for name, m in _UNITS_M.items() if abs(np.log(by_actor / m)) < near), None)
+    unit = next((name for name, m in _UNITS_M.items() if abs(found.numbers[0] - np.log(m)) < near), None)
     alone = unit is not None
     if flight.truth_m is not None:
         alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
@@ -314,37 +319,20 @@ def scales(trial: Trial, joints: Float, stature: float, dearer: float) -> Iterat
         if not of_poses:
             hips, ground = None if hips is None else size * hips, ground and ground.scaled(size)
         if of_poses and unit is not None:
-            factor, code, cost, evidence = _UNITS_M[unit], "unit", PRICE_OF_ALL, {}
+            factor, code, price, evidence = _UNITS_M[unit], "unit", PRICE_OF_ALL, {}
             what = f"the positions are in {unit}"
             remedy = trial.lines(trial.every, remedies.pose, f"unit: {unit}")
         else:
-            factor, share = (by_actor, sigma) if of_poses else (size, SIZE_SIGMA)
-            code, cost, evidence = "scale", price, {"scale_sigma_share": round(share, 3)}
+            factor, share = (float(np.exp(found.numbers[0])), sigma) if of_poses else (size, SIZE_SIGMA)
+            code, evidence = "scale", {"scale_sigma_share": round(share, 3)}
+            # Any scale makes the person as tall as people are: that much surer the stature makes it.
+            price = PRICE_OF_ALL + np.log(1 / SIZE_SIGMA) / 2 + dearer
             what = f"all positions are {1 / factor:.2g} times what they should be:"
             what += f" the person is {stature:.3g} m tall"
             of_logs = trial.lines(trial.every, remedies.placed, np.zeros(3), factor=factor)
             remedy = of_logs if of_poses else f"world.scale: {size:.3g}"
-        # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
-        of_places = np.array([factor, 1.0] * 3)
-        place, sigma = described.position * factor, described.sigma * of_places
-        scene = replace(described, position=place, sigma=sigma, hips=hips, ground=ground)
-        yield Alternative(code, trial.names, what, remedy, cost, scene, True, evidence)
-
-
-def _scaled_to_actor(trial: Trial, joints: Float, size: float) -> tuple[float, float]:
-    """Return the factor of all positions that the stature and a logged actor show, and its relative error."""
-    if trial.flight.hips is None:
-        return size, SIZE_SIGMA
-    hips = Body(joints).hips
-    known = np.isfinite(hips + trial.flight.hips).all(axis=1)
-    far2 = float((hips[known] ** 2).sum())
-    factor = float((hips * trial.flight.hips)[known].sum()) / max(far2, 1e-9)
-    if factor <= 0:
-        return size, SIZE_SIGMA
-    # As for fits: an actor's errors wander, and count as few.
-    weights = np.array([1 / SIZE_SIGMA**2, FEW * factor**2 * far2 / known.sum() / PLACED_M**2])
-    found = float(np.exp(weights @ np.log([size, factor]) / weights.sum()))
-    return found, float(1 / np.sqrt(weights.sum()))
+        scene = replace(scaled(np.log([factor])), hips=hips, ground=ground)
+        yield Alternative(code, trial.names, what, remedy, price, scene, True, evidence)
 
 
 # --- alternatives without a number -----------------------------------------------------------------------

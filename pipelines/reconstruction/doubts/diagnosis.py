@@ -226,8 +226,7 @@ def diagnose(
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
     if "size" in found.odd and is_strained:
         dearer = 0.0 if found.odd["size"].sigmas >= _STRANGE_SIZE else _MARGIN
-        scales = alternatives.scales(trial, solve(trial.described).joints, found.stature_m, dearer)
-        tried += map(objective.scored, scales)
+        tried += map(objective.scored, alternatives.scales(trial, found.stature_m, dearer))
     # Times come last, since most of them need no exact score beside what fits by then.
     tried += map(objective.scored, alternatives.rates(trial))
     groups = [*([index] for index in trial.every), *([trial.every] if odd and trial.moving else [])]
@@ -275,9 +274,16 @@ class Tried(NamedTuple):
         return -np.inf if self.score is None else self.score.total + self.alternative.price
 
     @property
+    def gains(self) -> tuple[float, float]:
+        """By how much the alternative lowers the two parts of the objective, beyond its price."""
+        with np.errstate(invalid="ignore"):  # infinite both, where no rays can be fitted
+            by_score, by_rays = np.subtract(self.before, self.after)
+        return float(by_score), float(by_rays)
+
+    @property
     def gain(self) -> float:
-        """By how much the alternative lowers the objective, beyond its price."""
-        return sum(self.before) - sum(self.after)
+        """By how much the alternative lowers the objective."""
+        return sum(self.gains)
 
     def is_enough(self, odd: bool) -> bool:
         """Test if the gain is more than chance.
@@ -286,8 +292,7 @@ class Tried(NamedTuple):
         the rays alone must tell it; of times of one camera, they must fit as well, or tell it if nothing else
         does.
         """
-        with np.errstate(invalid="ignore"):  # infinite both, where no rays can be fitted
-            by_score, by_rays = np.subtract(self.before, self.after)
+        by_score, by_rays = self.gains
         if self.alternative.code in TIMES:
             is_scored = by_score >= _LEAST_GAIN_OF_TIMES
             least = -_ALIKE if is_scored and self.alternative.same_pictures is None else _MARGIN
@@ -295,7 +300,7 @@ class Tried(NamedTuple):
             least = -np.inf if odd else _MARGIN
         # Whoever is far too tall or small is doubted anyway.
         margin = 0.0 if self.alternative.code == "scale" else _MARGIN
-        return self.gain >= margin and bool(by_rays >= least)
+        return self.gain >= margin and by_rays >= least
 
 
 class Objective:
@@ -406,17 +411,19 @@ class Objective:
         other errors: whichever saves less counts. Larger errors excuse everything: of them only the chi^2
         counts.
         """
-        alternative, scene, described = tried.alternative, tried.alternative.scene, self.described
+        alternative, scene = tried.alternative, tried.alternative.scene
         if scene is None or tried.score is None:
             return tried
         is_time, of_one = alternative.code in TIMES, alternative.same_pictures is None
-        beside = described if is_time else None
+        beside = self.described if is_time else None
         cost = tried.cost if np.isfinite(tried.cost) else self._fit(scene, beside).cost
-        found = self._told(tried, self.base.total, described.cost, cost)
-        if not (is_time or alternative.code == "videos_swapped") or found.gain < _MARGIN:
+        found = self._told(tried, self.base.total, self.described.cost, cost)
+        by_score, by_rays = found.gains
+        # The same pictures cost the description no more, and chance excuses rays that fit worse.
+        if not (is_time or alternative.code == "videos_swapped") or by_score + max(by_rays, 0.0) < _MARGIN:
             return found
         same = self._at_moments_of(scene)
-        before = min(self._fit(same, described).cost, self._cost_of_pictures(scene))
+        before = min(self._fit(same, self.described).cost, self._cost_of_pictures(scene))
         total = min(self.base.total, score(same, self.base).total)
         if alternative.same_pictures is not None:
             of_poses = alternative.same_pictures()
