@@ -797,10 +797,18 @@ class _Stretch:
         return PosePriorArrays(self.place, self.knot_place, self.knot, self.share, white, start, left, added)
 
     def _add_motion(self, position: Float, band: Float, force: Float) -> None:
-        """Add that cameras at `position` [T, 3] accelerate little, to the normal equations of the poses."""
-        before, after = np.diff(self._times_s())[:-1], np.diff(self._times_s())[1:]
+        """Add that cameras at `position` [T, 3] accelerate little, to the normal equations of the poses.
+
+        A stamp that is wrong by as much as stamps are irregular moves a picture along the path.
+        """
+        steps = np.diff(self._times_s())
+        before, after, usual = steps[:-1], steps[1:], float(np.median(steps))
+        lag = int(np.clip(round(1 / usual), 1, len(steps)))
+        speed = np.median(np.linalg.norm(position[lag:] - position[:-lag], axis=1)) / (lag * usual)
+        late_m = speed * np.median(np.abs(steps - usual))  # steps vary by sqrt(2) of what stamps do
         share = np.stack([1 / before, -1 / before - 1 / after, 1 / after])  # of three places, [3, T - 2]
-        share *= 2 / ((before + after) * _ACCELERATION_MPS2)
+        share *= 2 / (before + after)
+        share /= np.hypot(_ACCELERATION_MPS2, late_m * np.linalg.norm(share, axis=0))
         count = len(before)
         excess = sum(share[k][:, None] * position[k : k + count] for k in range(3))
         for k, axis in product(range(3), range(3)):
