@@ -1085,7 +1085,7 @@ def refine_cameras(
                 "reprojection_px": found.reprojection_px if used else None,
                 "rotation_sigma_deg": {
                     "log": float(np.degrees(prior.level[1])),
-                    "background": float(np.degrees(np.sqrt(np.median(turn)))) if used else None,
+                    "background": float(np.degrees(np.sqrt(np.nanmedian(turn)))) if used else None,
                 },
             } | ({} if aside is None else {"aside_deg": float(np.degrees(aside[1]))})
             if found.frozen:
