@@ -48,6 +48,7 @@ from tests.synthetic.described_flights import (
     looks_left,
     mirrored,
     mistaken,
+    moved,
     of_cameras,
     of_mounts,
     of_poses,
@@ -527,13 +528,17 @@ def test_film_has_no_keys_of_keypoints(flight: Described) -> None:
     assert fx == pytest.approx(2 * cameras[1].intrinsics.fx, abs=0.1)
 
 
-def test_drones_below_zero_count_z_downwards(flight: Described) -> None:
-    def downwards(mistaken: Mistaken) -> None:
-        of_poses(lambda pose: (pose[0] * [1, 1, -1], pose[1]))(mistaken)
-        for key in ("map", "actor", "logs"):  # which would say how high the ground is
-            del mistaken.manifest[key]
+def test_drones_below_zero_count_z_downwards_or_have_zero_high_above(flight: Described) -> None:
+    def placed(change: Change) -> Path:
+        def apply(mistaken: Mistaken) -> None:
+            change(mistaken)
+            for key in ("map", "actor", "logs"):  # which would say how high the ground is
+                del mistaken.manifest[key]
 
-    manifest = mistaken(flight, downwards)
+        return mistaken(flight, apply)
+
+    assert {doubt["code"] for doubt in doubts_of(placed(moved([0, 0, -60])))} == {"axes"}
+    manifest = placed(of_poses(lambda pose: (pose[0] * [1, 1, -1], pose[1])))
     first = doubts_of(manifest)[0]
     assert first["code"] == "axes"
     assert with_remedy(manifest, first["remedy"])

@@ -34,7 +34,6 @@ from pipelines.reconstruction.doubts.scene import (
     scene_of,
     trunk_direction,
 )
-from pipelines.reconstruction.doubts.score import fit
 from pipelines.reconstruction.observations import Filmed
 from pipelines.reconstruction.solving import NOSE_TO_ANKLES
 from pipelines.session.people import mirrored
@@ -290,27 +289,28 @@ def level(trial: Trial, joints: Float) -> Iterator[Alternative]:
     yield Alternative("level", trial.names, what, remedy, 0.0, evidence=evidence)
 
 
-def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]:
+def scaled(scene: SceneOfMoments, numbers: Float) -> SceneOfMoments:
+    """Scale all positions by the factor whose logarithm is the one of the numbers [1].
+
+    Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
+    """
+    place, sigma = scene.position.copy(), scene.sigma.copy()
+    place *= np.exp(numbers[0])
+    sigma[:, ::2] *= np.exp(numbers[0])
+    return replace(scene, position=place, sigma=sigma)
+
+
+def scales(trial: Trial, stature: float, fitted: tuple[float, float], dearer: float) -> Iterator[Alternative]:
     """Scale all positions so that the person has a usual stature: rays that fit go on fitting.
 
     What else is placed in the world, as a map or an actor, is scaled with them, or is right as it is. The
-    truth, if there is one, says which line changes no more than is wrong.
+    truth, if there is one, says which line changes no more than is wrong. `fitted` is the logarithm of the
+    factor that the stature and a logged actor show, and its standard deviation.
     """
-    flight, described, size = trial.flight, trial.described, STATURE_M / stature
-
-    def scaled(numbers: Float) -> SceneOfMoments:
-        # Errors of positions are in the log's unit, too: so rays that fit go on fitting, and no better.
-        place, sigma = described.position.copy(), described.sigma.copy()
-        place *= np.exp(numbers[0])
-        sigma[:, ::2] *= np.exp(numbers[0])
-        return replace(described, position=place, sigma=sigma)
-
-    # The stature and a logged actor show it.
-    found = fit(scaled, np.log([size]))
-    sigma = float(np.sqrt(found.covariance[0, 0]))
+    flight, size, (number, sigma) = trial.flight, STATURE_M / stature, fitted
     # Units are far apart, so nearly all statures tell them.
     near = max(2 * sigma, SIZE_SIGMA)
-    unit = next((name for name, m in _UNITS_M.items() if abs(found.numbers[0] - np.log(m)) < near), None)
+    unit = next((name for name, m in _UNITS_M.items() if abs(number - np.log(m)) < near), None)
     alone = unit is not None
     if flight.truth_m is not None:
         alone = abs(np.log(flight.truth_m / STATURE_M)) < abs(np.log(size))
@@ -323,7 +323,7 @@ def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]
             what = f"the positions are in {unit}"
             remedy = trial.lines(trial.every, remedies.pose, f"unit: {unit}")
         else:
-            factor, share = (float(np.exp(found.numbers[0])), sigma) if of_poses else (size, SIZE_SIGMA)
+            factor, share = (float(np.exp(number)), sigma) if of_poses else (size, SIZE_SIGMA)
             code, evidence = "scale", {"scale_sigma_share": round(share, 3)}
             # Any scale makes the person as tall as people are: that much surer the stature makes it.
             price = PRICE_OF_ALL + np.log(1 / SIZE_SIGMA) / 2 + dearer
@@ -331,7 +331,7 @@ def scales(trial: Trial, stature: float, dearer: float) -> Iterator[Alternative]
             what += f" the person is {stature:.3g} m tall"
             of_logs = trial.lines(trial.every, remedies.placed, np.zeros(3), factor=factor)
             remedy = of_logs if of_poses else f"world.scale: {size:.3g}"
-        scene = replace(scaled(np.log([factor])), hips=hips, ground=ground)
+        scene = replace(scaled(trial.described, np.log([factor])), hips=hips, ground=ground)
         yield Alternative(code, trial.names, what, remedy, price, scene, True, evidence)
 
 
@@ -544,9 +544,8 @@ NUMBERS = {"shift": 3, "heading": 1, "north": 1, "zero": 4, "pitch": 1, "roll": 
 """Numbers of a description that may be wrong, and how many of them each alternative sets free.
 
 `shift`: each log has its zero elsewhere, by numbers of its own; `north`: it has its north elsewhere; `zero`:
-both. `heading`,
-`pitch`, `roll`: the camera is turned where it is, about the vertical or its own x and z axes. `focal`: its
-focal length is another; the number is then the logarithm of the factor.
+both. `heading`, `pitch`, `roll`: the camera is turned where it is, about the vertical or its own x and z
+axes. `focal`: its focal length is another; the number is then the logarithm of the factor.
 """
 
 # The code and the sentence of each.

@@ -226,7 +226,9 @@ def diagnose(
         tried += map(objective.with_noise, alternatives.larger_errors(trial))
     if "size" in found.odd and is_strained:
         dearer = 0.0 if found.odd["size"].sigmas >= _STRANGE_SIZE else _MARGIN
-        tried += map(objective.scored, alternatives.scales(trial, found.stature_m, dearer))
+        size = fit(partial(alternatives.scaled, trial.described), np.log([STATURE_M / found.stature_m]))
+        fitted = float(size.numbers[0]), float(np.sqrt(size.covariance[0, 0]))
+        tried += map(objective.scored, alternatives.scales(trial, found.stature_m, fitted, dearer))
     # Times come last, since most of them need no exact score beside what fits by then.
     tried += map(objective.scored, alternatives.rates(trial))
     groups = [*([index] for index in trial.every), *([trial.every] if odd and trial.moving else [])]
@@ -611,6 +613,11 @@ _UNUSUAL = {
     "tread": ("body", "legs go at {legs_over_pace:.1f} times the pace: the standing foot slides"),
     "speed": ("body", "the person is faster than people run: {pace_mps:.1f} m/s"),
     "above": ("ground", "the person is {above_m:.1f} m above the drones"),
+    "below": (
+        "axes",
+        "all drones fly {below_m:.1f} m or more below zero: their positions count z downwards, or zero is"
+        " high above the ground",
+    ),
     "ground": ("ground", "the feet are {feet_above_ground_m:+.1f} m from the ground of the map"),
     "beside": ("ground", "the person is beside the map"),
     "level": ("ground", "the feet rise by {rise_m:.1f} m on a way of {walked_m:.1f} m"),
