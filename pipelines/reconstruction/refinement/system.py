@@ -116,10 +116,6 @@ class Knowledge:
     """
 
 
-# A size this many standard deviations off counts half: children are smaller than people usually are.
-_SIZE_LOSS = 2.0
-
-
 @dataclass(frozen=True)
 class UsualSize:
     """Sizes of P people by the sums of some bones' lengths."""
