@@ -799,13 +799,13 @@ class _Stretch:
     def _add_motion(self, position: Float, band: Float, force: Float) -> None:
         """Add that cameras at `position` [T, 3] accelerate little, to the normal equations of the poses.
 
-        A stamp that is wrong by as much as stamps are irregular moves a picture along the path.
+        A stamp that is wrong by as much as it is irregular moves its picture along the path.
         """
         steps = np.diff(self._times_s())
         before, after, usual = steps[:-1], steps[1:], float(np.median(steps))
         lag = int(np.clip(round(1 / usual), 1, len(steps)))
         speed = np.median(np.linalg.norm(position[lag:] - position[:-lag], axis=1)) / (lag * usual)
-        late_m = speed * np.median(np.abs(steps - usual))  # steps vary by sqrt(2) of what stamps do
+        late_m = speed * np.maximum(np.abs(before - usual), np.abs(after - usual))
         share = np.stack([1 / before, -1 / before - 1 / after, 1 / after])  # of three places, [3, T - 2]
         share *= 2 / (before + after)
         share /= np.hypot(_ACCELERATION_MPS2, late_m * np.linalg.norm(share, axis=0))
