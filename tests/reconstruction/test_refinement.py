@@ -339,6 +339,14 @@ def test_lasting_errors_of_metres_leave_the_place_unknown_and_the_size_to_what_i
     assert np.sqrt(found.covariance[0, :, 2, 2].mean()) == pytest.approx(1.5 / np.sqrt(3), rel=0.05)
 
 
+def test_a_size_two_standard_deviations_off_counts_half() -> None:
+    size, lengths = UsualSize(np.array([[0.4, 0.6]]), 0.05), np.array([0.4, 0.5])  # 0.9 m where 1 m is usual
+    slope, missed = size.equations(lengths)
+    # Half the weight of a Gaussian: -2 sigma / 0.05 m; the cost is s^2 log(1 + 2^2 / s^2) with s = 2.
+    np.testing.assert_allclose(slope.T @ missed, 0.5 * -2 / 0.05)
+    assert size.cost(lengths) == pytest.approx(4 * np.log(2))
+
+
 def test_keypoint_errors_that_last_are_not_taken_for_pose_errors() -> None:
     # With an autocorrelation of 0.9, 19 neighbours count as one: tau = (1 + 0.9) / (1 - 0.9).
     flight = formation(150, 3, [], 0, pixel_px=4.0, memory=0.9)

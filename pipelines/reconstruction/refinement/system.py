@@ -116,9 +116,13 @@ class Knowledge:
     """
 
 
+# A size this many standard deviations off counts half: children are smaller than people usually are.
+_SIZE_LOSS = 2.0
+
+
 @dataclass(frozen=True)
 class UsualSize:
-    """Sizes of P people by the sums of some bones' lengths."""
+    """Sizes of P people by the sums of some bones' lengths; a heavy tail leaves room for children."""
 
     lengths_m: Float  # [P, B] usual lengths, 0 for bones that do not count
     sigma: float  # standard deviation of a sum, relative to it
@@ -130,10 +134,17 @@ class UsualSize:
         return replace(self, lengths_m=lengths) if len(lengths) else None
 
     def equations(self, lengths: Float) -> tuple[Float, Float]:
-        """Return derivatives [P, B] by the lengths [B] m, and residuals [P], in standard deviations."""
+        """Return derivatives [P, B] by lengths [B] m, and residuals [P], weighted standard deviations."""
         usual = self.lengths_m.sum(axis=1, keepdims=True)
         slope = (self.lengths_m > 0) / (self.sigma * usual)
-        return slope, slope @ lengths - 1 / self.sigma
+        off = slope @ lengths - 1 / self.sigma
+        weight = 1 / np.hypot(1, off / _SIZE_LOSS)
+        return weight[:, None] * slope, weight * off
+
+    def cost(self, lengths: Float) -> float:
+        """Compute the cost of lengths [B] m by a Cauchy distribution of the sizes."""
+        off = (lengths @ (self.lengths_m > 0).T / self.lengths_m.sum(axis=1) - 1) / self.sigma
+        return float(_SIZE_LOSS**2 * np.log1p(np.square(off / _SIZE_LOSS)).sum())
 
 
 @dataclass(frozen=True)
@@ -443,5 +454,5 @@ def _body_cost(system: System, state: State) -> float:
         cost += np.sum((missed / system.knowledge.bone_sigma_m) ** 2)
     cost /= system.grown(state) ** 2
     if problem.size is not None:
-        cost += np.square(problem.size.equations(lengths)[1]).sum()
+        cost += problem.size.cost(lengths)
     return float(cost)
