@@ -68,8 +68,9 @@ _LEVEL_ROUNDS = 3
 # Constant errors have this share of the usual level where the pictures let the scene grow.
 _HELD = 0.1
 # Detectors place joints to 1 % of a person's height (simulation/data/blazepose_errors.csv). What varies of
-# that is seen in residuals; the rest lasts.
-KEYPOINT_SIGMA_M, _LEAST_LASTING_M = 0.02, 0.005
+# that is seen in residuals; the rest lasts, and is half of the variance at least
+# (`detector_errors.LASTING_SHARE`).
+KEYPOINT_SIGMA_M = 0.02
 # A joint that one camera alone shows follows its motion at other times by this (m).
 _FOLLOWED_M = 0.3
 # A constant error below this share of the usual level is known from the background.
@@ -339,7 +340,7 @@ def _of_lasting_errors(system: System, position: Float) -> Float:
         usable = np.isfinite(pictures.rays[own][..., 0]) & (seen[..., 2] > 0.1)
         with np.errstate(divide="ignore"):
             varying2 = (seen[..., 2] / pictures.sharpness[own]) ** 2
-        lasting2 = np.maximum(KEYPOINT_SIGMA_M**2 - varying2, _LEAST_LASTING_M**2)
+        lasting2 = np.maximum(KEYPOINT_SIGMA_M**2 - varying2, varying2)
         weight = np.where(usable, 1 / lasting2, 0.0)
         information += weight[..., None, None] * np.einsum("tjai,tjak->tjik", slant, slant)
     return np.asarray(np.linalg.inv(information))
