@@ -180,9 +180,9 @@ def page_of(stored: Mapping[str, Mapping[str, Any]]) -> str:
         *_words(
             "All figures, with kind, command, date and commit."
             " `python -m benchmarks.results` measures the sample again and writes this page; the other"
-            " commands replace their tables with `--write`. No constant was chosen because of flights kept"
-            " aside. Closed loops of planners amplify rounding: other processors change their figures by up"
-            " to 8 %."
+            " commands replace their tables with `--write`. Of flights kept aside, 22-jog alone chose a"
+            " constant (free white errors). Closed loops amplify rounding: other processors change their"
+            " figures by up to 8 %."
         ),
     ]
     before = ""  # the command of the table above, which is not repeated
