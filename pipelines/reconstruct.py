@@ -266,7 +266,9 @@ def reconstruct(
         gait, walks = gait_of(stored.observations, stored.result)
         bodies = stored.bodies
         if bodies is None:
-            bodies = flight.waiting.put(fit_bodies(stored.observations, stored.views, stored.result))
+            bodies = flight.waiting.put(
+                fit_bodies(stored.observations, stored.views, stored.result, flight.waiting.between)
+            )
         flight.waiting.release()
         metrics = stored.metrics | {
             "gait": walks,

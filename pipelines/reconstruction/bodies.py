@@ -1,6 +1,6 @@
 """Bodies of the reconstructed people: fitted to their joints, as tables, and compared with true surfaces."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,8 +54,16 @@ _LONGEST_STEP_NS = 200_000_000
 _TIMES_AT_ONCE = 4096
 
 
-def fit_bodies(observations: Observations, views: Views, result: Triangulation) -> list[BodyFit | None]:
-    """Fit a body to each person; an empty list if the landmarks of the skeleton are not known."""
+def fit_bodies(
+    observations: Observations,
+    views: Views,
+    result: Triangulation,
+    between: Callable[[range], Iterable[int]],
+) -> list[BodyFit | None]:
+    """Fit a body to each person; an empty list if the landmarks of the skeleton are not known.
+
+    `between` gives memory back between parts of a long flight.
+    """
     found = landmarks_of(observations.joints)
     if found is None:
         return []
@@ -67,7 +75,7 @@ def fit_bodies(observations: Observations, views: Views, result: Triangulation) 
     for person in range(people):
         first_row = (np.arange(times) * people + person) * joints
         errors = partial(_errors, landmarks, views, result, first_row, columns)
-        bodies.append(fit_body(landmarks, observations.t_ns, place[:, person, columns], errors))
+        bodies.append(fit_body(landmarks, observations.t_ns, place[:, person, columns], errors, between))
     return bodies
 
 

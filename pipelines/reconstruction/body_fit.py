@@ -16,7 +16,7 @@ are smooth already. Every step is Gauss-Newton with the derivatives of world rot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -274,13 +274,18 @@ class Normal:
 
 
 def fit_body(
-    landmarks: Landmarks, t_ns: Int64, place: Float, errors: Callable[[Index], tuple[Float, Float, Float]]
+    landmarks: Landmarks,
+    t_ns: Int64,
+    place: Float,
+    errors: Callable[[Index], tuple[Float, Float, Float]],
+    between: Callable[[range], Iterable[int]] = iter,
 ) -> BodyFit | None:
     """Fit the body to one person's K landmarks, `place` [T, K, 3] m, NaN where missing; None without one.
 
     `errors` gives for N of the times the covariances m^2 of each landmark's own error [N, K, 3, 3], and of
     the error that all landmarks of a time share [N, 3, 3], and the variance of the scale [N], which is taken
-    for constant. The body has all times with both hips, both shoulders and ten landmarks.
+    for constant. The body has all times with both hips, both shoulders and ten landmarks. `between` gives
+    memory back between parts of a long flight.
     """
     known = np.asarray(np.isfinite(place).all(axis=-1))
     trunk = [landmarks.joints.index(name) for name in TRUNK]
@@ -298,7 +303,7 @@ def fit_body(
     own, _, scale = errors(chosen)
     shared, shared_covariance = _fit_shared(points, first, _seen(place[chosen], own), float(np.median(scale)))
     joined: list[Any] = []  # filled part by part, because parts joined at last are in memory twice
-    for start in range(0, len(row), _BLOCK):
+    for start in between(range(0, len(row), _BLOCK)):
         rows = row[start : start + _BLOCK]
         own, common, _ = errors(rows)
         first, seen = _first_poses(model, landmarks, place[rows]), _seen(place[rows], own)
