@@ -10,7 +10,8 @@ places and a horizon level to 2 deg; satellite places tell less than the true ho
 `NEES` is the mean squared common error over its mean variance by axis, 3 where right.
 
 `--used` reconstructs flights in turn with attitudes by pictures, and with logged ones (`TURNED`) on the same
-places. Ratios are of root-relative errors: of the means, and by draw. NEES is of joints.
+places. Ratios are of root-relative errors: of the means, and by draw. NEES is of joints. `off` is the root
+mean square angle of the estimated attitudes from the true ones, over cameras and draws.
 
 `--joined` takes the places away, too (`pose: pictures`, stature stated). `off` is then that of the cameras'
 mean attitudes after one similarity; joints are compared in true axes, with their own scale.
@@ -29,6 +30,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.corpus.drawn import DrawnFlight, kept_in_place_of_pictures
 from benchmarks.corpus.stored import Flight, flights, read_backgrounds, read_keypoints
@@ -62,7 +64,7 @@ from pipelines.session.camera_poses import noise_models
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent
 from pipelines.session.records import Trajectory
-from pipelines.session.tables import detections_from
+from pipelines.session.tables import CAMERA_POSES, detections_from, read_table
 from pipelines.simulation.flight import SimulatedDrone
 from pipelines.simulation.flight_files import write_tum
 from pipelines.sources.attitudes import FilmOfCamera, UnposedCamera, posed_by_people, turned_by_pictures
@@ -104,7 +106,15 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
         return
     names = options.flights or (KEPT if options.kept else TUNED)
     if options.used is not None:
-        columns = ["log", "reconstructed", "logged, other mm", "ratio", "by draw: median, largest", "NEES"]
+        columns = [
+            "log",
+            "reconstructed",
+            "logged, other mm",
+            "ratio",
+            "by draw: median, largest",
+            "NEES",
+            "off",
+        ]
         # Of two people without logs, either may be the only one.
         alone = [e.name for e in flights() if e.name in names[:-1] and len(e.scenario.people) == 1]
         rows = [used(options.flights or alone, log, options.draws) for log in options.used or USED]
@@ -181,14 +191,15 @@ def used(names: Sequence[str], log: str, draws: int) -> list[str]:
         except DataError as error:
             print(f"{name}, draw {draw}: refused: {error}")
     if not found:
-        return [log, f"0/{draws}", *4 * ["-"]]
-    (first, nees), (second, others) = np.mean(found, axis=0)
+        return [log, f"0/{draws}", *5 * ["-"]]
+    (first, nees, _), (second, others, _) = np.mean(found, axis=0)
+    off = ", ".join(f"{each:.2f}" for each in np.sqrt(np.mean(found, axis=0)[:, 2]))
     ratio = [each[1][0] / each[0][0] for each in found]
     row = [f"{first:.0f}, {second:.0f}", f"{second / first:.2f}", f"{np.median(ratio):.2f}, {max(ratio):.2f}"]
-    return [log, f"{len(found)}/{draws}", *row, f"{nees:.1f}, {others:.1f}"]
+    return [log, f"{len(found)}/{draws}", *row, f"{nees:.1f}, {others:.1f}", off]
 
 
-def _used_once(name: str, log: str, draw: int) -> list[tuple[float, float]]:
+def _used_once(name: str, log: str, draw: int) -> list[tuple[float, float, float]]:
     logged: dict[str, tuple[Trajectory, Noise]] = {}
     (place_log, far), other = USED[log], logged.copy()
     noise, step_s = LOGS[place_log]
@@ -202,8 +213,8 @@ def _used_once(name: str, log: str, draw: int) -> list[tuple[float, float]]:
         for number, drone in enumerate(drawn.simulated.drones):
             t_ns, true, camera = drone.at_frames.t_ns, drone.at_frames.camera_position, drone.name
             poses = t_ns, true, drone.at_frames.camera_quaternion_xyzw
-            # Receivers share half of the variance. To a seed, a 0 at its end is nothing.
-            seeds = [5, draw, 1 + number], [5, draw]
+            # Satellite receivers share half of the variance. To a seed, a 0 at its end is nothing.
+            seeds = [5, draw, 1 + number], [5, draw] if place_log == "gps" else [5, draw, 101 + number]
             errors = [disturb(models, *poses, np.random.default_rng(seed))[0] - true for seed in seeds]
             step = max(round(step_s * 1e9 / float(np.median(np.diff(t_ns)))), 1)
             rows = np.append(np.arange(0, len(t_ns) - 1, step), len(t_ns) - 1)
@@ -237,14 +248,25 @@ def _session_of(drawn: DrawnFlight, place: Path, tracks: Mapping[str, tuple[Traj
     return ingest(manifest, manifest.with_name("posed")).folder
 
 
-def _outcome(flight: Flight, session: Path) -> tuple[float, float]:
-    """Reconstruct with the keypoints and the background that are kept; return root-relative mm, and NEES."""
+def _outcome(flight: Flight, session: Path) -> tuple[float, float, float]:
+    """Reconstruct with what is kept of the films; return root-relative mm, NEES, and squared degrees off."""
     from benchmarks.accuracy import outcome_of  # which imports this module
 
     with kept_in_place_of_pictures(flight, "blazepose"):
         reconstruct(session, ReconstructSettings(people=1))
-    found = outcome_of(session)
-    return found.root_mpjpe_mm or np.nan, found.nees or np.nan
+    found, squared = outcome_of(session), []
+    true, estimated = (
+        read_table(session / name, CAMERA_POSES)
+        for name in ("truth_poses.parquet", "reconstruct/cameras.parquet")
+    )
+    for camera, own in estimated.groupby("camera"):
+        logged = true[true["camera"] == camera]
+        turn, of_log = (each[["qx", "qy", "qz", "qw"]].to_numpy(np.float64) for each in (own, logged))
+        t_ns = own["t_ns"].clip(logged["t_ns"].min(), logged["t_ns"].max())
+        there = Slerp(logged["t_ns"], Rotation.from_quat(of_log))(t_ns)
+        squared.append((Rotation.from_quat(turn) * there.inv()).magnitude() ** 2)
+    off = float(np.degrees(1) ** 2 * np.concatenate(squared).mean())
+    return found.root_mpjpe_mm or np.nan, found.nees or np.nan, off
 
 
 def joined(name: str) -> list[str]:

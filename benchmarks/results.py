@@ -131,7 +131,6 @@ SECTIONS = (
         (
             Part("speed", "Speed, and peers", "measured", ""),
             Part("scale", "Long flights: memory and time", MODELLED, ""),
-            Part("scale-accuracy", "Flights of 90 s: errors", MODELLED, ""),
         ),
     ),
 )

@@ -1,10 +1,6 @@
-"""Long flights: errors, memory and time of the commands.
+"""Long flights: memory, time and page of each command: `python -m benchmarks.scale [--minutes 2 10]`.
 
-    python -m benchmarks.scale [--minutes 2 10]        # memory, time and page of each command
-    python -m benchmarks.scale --accuracy [--count 8]  # `auto` beside `robust` on flights of 90 s
-
-Everything is simulated, with modelled keypoints and no film. Each command of --minutes has a process of its
-own.
+Everything is simulated, with modelled keypoints and no film. Each command has a process of its own.
 """
 
 import json
@@ -20,16 +16,11 @@ import yaml  # type: ignore[import-untyped]
 from benchmarks.flights import SAMPLE
 from benchmarks.results import fixed, markdown_table, parser_of, show
 from pipelines.ingest import ingest
-from pipelines.reconstruct import ReconstructSettings, reconstruct
 from pipelines.simulate import simulate
 
-_CONSTANT = {
+_NOISE = {
     "white": {"position_m": 0.02, "rotation_deg": 0.2},
     "bias": {"position_m": 0.05, "rotation_deg": 0.3},
-}
-_DRIFTING = {
-    "white": {"position_m": 0.02, "rotation_deg": 0.2},
-    "gauss-markov": {"position_m": 0.1, "rotation_deg": 0.4, "correlation_s": 20},
 }
 COMMANDS = (
     ("reconstruct", "--workers", "1"),
@@ -49,16 +40,15 @@ print(json.dumps([code, used.ru_maxrss, used.ru_utime + used.ru_stime]))
 """
 
 
-def flown(seed: int, seconds: float, place: Path) -> Path:
-    """Fly the sample's scenario with a longer walk, and two or three drones; return flight.yaml."""
+def flown(seconds: float, place: Path) -> Path:
+    """Fly the sample's scenario with a longer walk; return flight.yaml."""
     document: Any = yaml.safe_load((SAMPLE / "scenario.yaml").read_text(encoding="utf-8"))
-    turn = (-75, 60, 80, 45)[seed % 4]
-    walk = {"walk": {"distance_m": 16, "turn_deg": turn, "speed_mps": 1.3}}
+    walk = {"walk": {"distance_m": 16, "turn_deg": -75, "speed_mps": 1.3}}
     document["actor"]["motion"] = [walk] * (int(seconds / 12) + 1)
-    document["drones"]["count"] = 2 + seed // 2 % 2
-    document["drones"]["pose_noise"] = _DRIFTING if seed % 2 else _CONSTANT
+    document["drones"]["count"] = 2
+    document["drones"]["pose_noise"] = _NOISE
     place.mkdir(parents=True, exist_ok=True)
-    document |= {"seed": seed, "duration_s": seconds}
+    document |= {"seed": 300, "duration_s": seconds}
     (place / "scenario.yaml").write_text(yaml.safe_dump(document), encoding="utf-8")
     simulate(place / "scenario.yaml", place / "made", video=False)
     return place / "made" / "flight.yaml"
@@ -67,7 +57,7 @@ def flown(seed: int, seconds: float, place: Path) -> Path:
 def commands(minutes: float) -> Iterator[list[str]]:
     """Run the commands of a session of so many minutes; yield command, peak MB, processor s, page MB."""
     with tempfile.TemporaryDirectory(prefix="scale-") as folder:
-        session = ingest(flown(300, 60 * minutes, Path(folder)), Path(folder) / "long.session").folder
+        session = ingest(flown(60 * minutes, Path(folder)), Path(folder) / "long.session").folder
         for command, *options in COMMANDS:
             peak_mb, took_s = cost_of(command, str(session), *options)
             row = [f"{minutes:g}", command, fixed(peak_mb), fixed(took_s), ""]
@@ -90,42 +80,13 @@ def cost_of(command: str, *options: str) -> tuple[float, float]:
     return peak_kib * 1024 / 1e6, took_s
 
 
-def accuracy(seed: int) -> Iterator[list[str]]:
-    """Reconstruct a flight of 90 s by both methods, with its pose noise stated and without."""
-    with tempfile.TemporaryDirectory(prefix="scale-") as folder:
-        manifest = flown(seed, 90.0, Path(folder))
-        document: Any = yaml.safe_load(manifest.read_text(encoding="utf-8"))
-        for stated in (True, False):
-            if not stated:
-                for camera in document["cameras"].values():
-                    del camera["pose_noise"]
-            path = manifest.with_name(f"{stated}.yaml")
-            path.write_text(yaml.safe_dump(document), encoding="utf-8")
-            session = ingest(path, Path(folder) / f"{stated}.session").folder
-            found = [reconstruct(session, ReconstructSettings(method=m)).metrics for m in ("robust", "auto")]
-            yield [
-                f"{seed}, {len(document['cameras'])} drones, {'drifting' if seed % 2 else 'constant'}",
-                "yes" if stated else "no",
-                *(fixed(each[key]) for key in ("mpjpe_mm", "root_mpjpe_mm") for each in found),
-            ]
-
-
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--minutes", type=float, nargs="+", default=[2.0, 10.0])
-    parser.add_argument("--accuracy", action="store_true", help="errors of flights of 90 s instead")
-    parser.add_argument("--first", type=int, default=300, help="seed of the first flight of --accuracy")
-    parser.add_argument("--count", type=int, default=8, help="flights of --accuracy")
     options = parser.parse_args()
-    if options.accuracy:
-        key, header = "scale-accuracy", ["flight", "noise stated", "robust", "auto"]
-        header += ["root-relative, robust", "root-relative, auto"]
-        seeds = range(options.first, options.first + options.count)
-        rows = [row for seed in seeds for row in accuracy(seed)]
-    else:
-        key, header = "scale", ["minutes", "command", "peak MB", "CPU s", "page MB"]
-        rows = [row for minutes in options.minutes for row in commands(minutes)]
-    show(key, markdown_table(header, rows), write=options.write)
+    header = ["minutes", "command", "peak MB", "CPU s", "page MB"]
+    rows = [row for minutes in options.minutes for row in commands(minutes)]
+    show("scale", markdown_table(header, rows), write=options.write)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from pipelines.reconstruction.one_camera import STATED_STATURE_SIGMA_M, STATURE_
 from pipelines.reconstruction.picture_map import (
     FAR_SHARE_TO_MAP_AGAIN,
     JOINED,
+    LEVEL_SIGMA_DEG,
     LIMB_SIGMA_SHARE,
     MOST_TRACKS,
     REVISION,
@@ -73,6 +74,10 @@ MAP_FILES = ("picture_map.parquet", "picture_map_sightings.parquet")
 
 # A satellite receiver's error decorrelates in minutes (docs/flight.md, Poses).
 SATELLITE_CORRELATION_S = 100.0
+
+# The mean attitude is free by so many of its standard deviations, and that of each picture by this much (maps
+# bend by less): then pictures that both the map and the estimate use hardly count twice.
+FREE_SIGMAS, FREE_DEG = 3.0, 1.0
 
 # A log's attitude that is further from the pictures' one is said: gimbals and compasses err by less.
 MAX_UNLIKE_DEG = 15.0
@@ -222,7 +227,8 @@ def turned_by_pictures(
         f" {laid.residual_m:.2g} m from its places; standard deviation {common_deg:.2g} deg of all,"
         f" {picture_deg:.2g} deg of each"
     )
-    turned = _of_laid(camera, name, key, found, laid, places, _with_rotation(stated, laid), note)
+    noise = _with_rotation(stated, laid, followed=rows_of_film(frames.pts_ns, rows) is not None)
+    turned = _of_laid(camera, name, key, found, laid, places, noise, note)
     return replace(turned, entry=turned.entry.model_copy(update={"unlike_log": unlike}))
 
 
@@ -393,17 +399,25 @@ def _errors(place: str, stated: Mapping[str, Mapping[str, float | str]] | None) 
 
 
 def _with_rotation(
-    stated: Mapping[str, Mapping[str, float | str]] | None, laid: LaidMap
+    stated: Mapping[str, Mapping[str, float | str]] | None, laid: LaidMap, *, followed: bool
 ) -> dict[str, dict[str, float | str]]:
-    """Return stated noise models of places with the found noise of attitudes."""
+    """Return stated noise models of places with that of attitudes: as found from photographs.
+
+    Of a film, whose points are `followed`, it says next to nothing. The estimate weighs the same points and
+    places, and what the map says follows from these: it would count twice.
+    """
     if stated is None:
         stated = {"white": {"position_m": round(laid.residual_m, 4)}, "bias": {"position_m": UNSTATED_BIAS_M}}
     merged: dict[str, dict[str, float | str]] = {
         model: {key: value for key, value in values.items() if not key.startswith("rotation_deg")}
         for model, values in stated.items()
     }
-    for model, sigma_rad in (("bias", laid.common_sigma_rad), ("white", laid.picture_sigma_rad)):
-        merged.setdefault(model, {})["rotation_deg"] = round(float(np.degrees(sigma_rad)), 4)
+    common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
+    if followed:
+        common_deg = float(np.hypot(FREE_SIGMAS * common_deg, LEVEL_SIGMA_DEG))
+        picture_deg = float(np.hypot(picture_deg, FREE_DEG))
+    for model, sigma_deg in (("bias", common_deg), ("white", picture_deg)):
+        merged.setdefault(model, {})["rotation_deg"] = round(sigma_deg, 4)
     return merged
 
 
