@@ -62,7 +62,6 @@ SPECIAL: dict[str, tuple[str, Any]] = {
     "background": ("reconstruction.background._MOST_UNBOUND", -1.0),
     "motion of drones": ("reconstruction.background._ACCELERATION_MPS2", np.inf),
     "ground": ("reconstruction.ground._FEWEST_PATCHES", 10**9),
-    "rotation levels in the ground": ("reconstruction.ground._rotation_level", lambda *_: np.inf),
     "cameras that stand": ("reconstruction.background._FEWEST_STANDING", 10**9),
     "joints without slow errors": ("reconstruction.refinement.refine.REMEMBERED", np.inf),
     "levels of constant errors": ("reconstruction.refinement.refine._with_constant_levels", lambda *_: None),

@@ -1218,13 +1218,7 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:
         sigma=np.sqrt(variances.mean(axis=2)),
         covariance=covariance,
         errors=found.left,
-        modes=ErrorModes(
-            t_ns[posed][::every],
-            found.modes[posed][::every],
-            found.shift_m,
-            found.turn,
-            found.prior.constant[1],
-        ),
+        modes=ErrorModes(t_ns[posed][::every], found.modes[posed][::every], found.shift_m),
         loosened=_loosened_still(camera.loosened_at(t_ns[posed]), variances.mean(axis=2)),
     )
 

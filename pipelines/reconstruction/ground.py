@@ -13,7 +13,7 @@ together and is given apart as a covariance that all joints share.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, permutations
 from typing import Any
@@ -26,7 +26,7 @@ from pipelines.geometry.cameras import project, row_delay_s, undistort
 from pipelines.geometry.noise import EXACT, ROTATION, SHIFT_IN_WORLD, USUAL_CONSTANT, USUAL_COUNT, Process
 from pipelines.geometry.poses import cross_matrix, multiply, quaternion_from_rotation_vector
 from pipelines.reconstruction.background_tracks import Followed, Stills, Tracks, people_boxes
-from pipelines.reconstruction.observations import Camera, ErrorModes
+from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Interpolation
 
 # Points of the cloud that were seen in fewer pictures are placed too badly.
@@ -226,22 +226,20 @@ def bind_positions(
             if not len(matches.pair):
                 used = np.zeros_like(used)
                 break
-            _, agree = _solve(matches, _PriorEquations.of(prior))
+            _, agree = _solve(matches, prior)
             both = (matches.pair, matches.pair[agree])
             counts = np.stack([np.bincount(pair, minlength=len(pairs)) for pair in both], axis=1)
             used = (counts[:, 1] >= _FEWEST_PATCHES / share) & (counts[:, 1] > _AGREE * counts[:, 0])
             if not used.any():
                 break
-            solution, _ = _solve(_of_pairs(matches, used), _PriorEquations.of(prior))
+            solution, _ = _solve(_of_pairs(matches, used), prior)
         if used.any():
             break
     if used.any():
         found = _of_pairs(matches, used)
-        turn_sigma = np.inf
         for _ in range(_LEVEL_ROUNDS):
             prior = _with_position_level(cameras, prior, solution)
-            turn_sigma = min(turn_sigma, _rotation_level(cameras, turn_sigma, solution))
-            solution, _ = _solve(found, _PriorEquations.of(prior).with_rotations(cameras, turn_sigma))
+            solution, _ = _solve(found, prior)
     return _bound(cameras, pairs, counts, used, solution, _prior_sigma(cameras))
 
 
@@ -645,45 +643,15 @@ def _assumed(cameras: Sequence[Camera]) -> Bool:
     return assumed
 
 
-def _rotated(cameras: Sequence[Camera]) -> Iterator[tuple[ErrorModes, Float]]:
-    """Yield what the background says of cameras of unknown levels, and their mean rotations [3, C U]."""
-    means = _means(cameras)
-    for c, camera in enumerate(cameras):
-        if camera.modes is not None and camera.errors is not None and camera.errors.assumed:
-            yield camera.modes, means[6 * c + 3 : 6 * c + 6]
-
-
-@dataclass(frozen=True)
-class _PriorEquations:
-    """Gaussian prior of all unknowns."""
-
-    precision: Float  # [C U, C U]
-    pull: Float  # [C U] precision times mean
-
-    @classmethod
-    def of(cls, sigma: Float) -> _PriorEquations:
-        """Build that of independent unknowns with mean 0."""
-        return cls(np.diag(sigma**-2.0), np.zeros(len(sigma)))
-
-    def with_rotations(self, cameras: Sequence[Camera], level: float) -> _PriorEquations:
-        """Narrow the prior of the logs' constant rotations to a level (rad); backgrounds took off a part."""
-        precision, pull = self.precision.copy(), self.pull.copy()
-        for modes, mean in _rotated(cameras):
-            more = max(level**-2.0 - modes.turn_sigma**-2.0, 0.0)
-            precision += more * mean.T @ mean
-            pull -= more * modes.turn @ mean
-        return _PriorEquations(precision, pull)
-
-
-def _solve(matches: _Matches, prior: _PriorEquations) -> tuple[_Solution, Bool]:
-    """Solve for all unknowns with a prior and errors that pairs share; patches [P] that agree."""
-    size = len(prior.pull)
+def _solve(matches: _Matches, prior: Float) -> tuple[_Solution, Bool]:
+    """Solve for all unknowns with prior standard deviations and errors of pairs; patches [P] that agree."""
+    size = len(prior)
     parts = [_PairEquations.of(matches, number, size) for number in np.unique(matches.pair).tolist()]
     every = np.diag(np.full(size + 3 * (int(matches.pair.max()) + 1), _PAIR_SIGMA_M**-2.0))
-    every[:size, :size] = prior.precision
+    every[:size, :size] = np.diag(prior**-2.0)
     errors = np.zeros(len(every))
     for k in range(_ROUNDS):
-        normal, right = every.copy(), np.append(prior.pull, np.zeros(len(every) - size))
+        normal, right = every.copy(), np.zeros(len(every))
         for part in parts:
             part.add(normal, right, errors, max(_LOSS, 16.0 / 2**k))
         covariance = np.linalg.inv(normal)
@@ -841,16 +809,6 @@ def _with_position_level(cameras: Sequence[Camera], prior: Float, solution: _Sol
     squares = float(np.sum(solution.errors[assumed] ** 2))
     level2 = (squares + USUAL_COUNT * USUAL_CONSTANT[0] ** 2) / (max(determined, 0.0) + USUAL_COUNT)
     return np.where(assumed, np.minimum(prior, np.sqrt(level2)), prior)
-
-
-def _rotation_level(cameras: Sequence[Camera], level: float, solution: _Solution) -> float:
-    """Estimate the level (rad) of constant rotations of logs by the same rule."""
-    squares, determined = 0.0, 0.0
-    for modes, mean in _rotated(cameras):
-        before = min(level, modes.turn_sigma)
-        squares += float(np.sum((modes.turn + mean @ solution.errors) ** 2))
-        determined += max(3.0 - float(np.trace(mean @ solution.covariance @ mean.T)) / before**2, 0.0)
-    return float(np.sqrt((squares + USUAL_COUNT * USUAL_CONSTANT[1] ** 2) / (determined + USUAL_COUNT)))
 
 
 def _largest_group(total: int, edges: Sequence[tuple[int, int]]) -> list[int]:

@@ -40,8 +40,6 @@ class ErrorModes:
     t_ns: Int64  # [S], two or more
     response: Float  # [S, 6, R] of position in the world (m) and rotation vector in the camera (rad)
     shift_m: float  # standard deviation of the constant shift
-    turn: Float  # [3] rad, the mean rotation error that was found and taken off
-    turn_sigma: float  # its standard deviation before, rad
 
     def at(self, t_ns: Int64) -> Float:
         """Interpolate the response [..., 6, R] at times [...] ns; beyond the ends, the nearest."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -119,7 +119,7 @@ class RobustFlight:
     trusted: Bool  # [P] people who determine cameras and clocks; the others are triangulated afterwards
     stature_m: float | None = None  # of the people, as stated
     only_limbs: bool = False  # other joints are not refined
-    waiting: Waiting | None = None  # where the arrays wait meanwhile
+    waiting: Waiting = field(default_factory=Waiting)  # where large arrays wait
 
     @cached_property
     def windows(self) -> list[FlightWindow]:
@@ -343,8 +343,7 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Float) 
     if flight.only_limbs:
         start = np.where(flight.limbs[:, None], start, np.nan)
     sightings = [_sighting(flight, c, camera) for c, camera in enumerate(cameras)]
-    if flight.waiting is not None:
-        flight.waiting.release()
+    flight.waiting.release()
     order = _Order(
         flight.t_s,
         sightings,
@@ -355,7 +354,7 @@ def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Float) 
         flight.measured,
         usual_size(flight.observations.joints, people, flight.stature_m),
     )
-    return _refine_in_windows(order, flight.windows, flight.workers, flight.executor)
+    return _refine_in_windows(order, flight.windows, flight.workers, flight.executor, flight.waiting)
 
 
 def _start_with_offsets(flight: RobustFlight, offset_s: Float) -> Float:
@@ -572,7 +571,11 @@ class _Order:
 
 
 def _refine_in_windows(
-    whole: _Order, windows: Sequence[FlightWindow], workers: int, executor: Executor | None
+    whole: _Order,
+    windows: Sequence[FlightWindow],
+    workers: int,
+    executor: Executor | None,
+    waiting: Waiting,
 ) -> Refined:
     """Run `refine` on some windows, and join the results: medians of clocks, NaN joints where none is."""
     if len(windows) == 1 and windows[0].stop - windows[0].first == len(whole.t_s):
@@ -581,9 +584,9 @@ def _refine_in_windows(
         memory = available_bytes()
         workers = workers if memory is None else min(workers, max(memory // WINDOW_BYTES, 1))
     orders = [whole.within(window) for window in windows]
-    joined = _Joined(whole)
+    joined = _Joined(whole, waiting)
     parts: list[Refined | None] = [None] * len(windows)
-    for number, found in each_part(_refine, orders, workers=workers, executor=executor):
+    for number, found in waiting.between(each_part(_refine, orders, workers=workers, executor=executor)):
         joined.add(windows[number], found)
         parts[number] = replace(found, position=whole.start[:0], covariance=whole.start[:0], corrections=())
     return joined.refined([part for part in parts if part is not None])
@@ -596,10 +599,10 @@ def _refine(order: _Order) -> Refined:
 class _Joined:
     """Weighted sums over windows; at most two contribute to a time, so that their order does not count."""
 
-    def __init__(self, whole: _Order) -> None:
+    def __init__(self, whole: _Order, waiting: Waiting) -> None:
         self._t_s, shape = whole.t_s, whole.start.shape
         self._weight = np.zeros(shape[:2])
-        self._position, self._covariance = np.zeros(shape), np.zeros((*shape, 3))
+        self._position, self._covariance = waiting.put((np.zeros(shape), np.zeros((*shape, 3))))
         self._frames = [sighting.t_s for sighting in whole.sightings]
         self._numbers = [np.zeros((len(frames), 11)) for frames in self._frames]  # and their weight
 

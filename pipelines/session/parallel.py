@@ -225,9 +225,9 @@ def available_bytes() -> int | None:
 
 
 class Waiting:
-    """Arrays in files of a folder, without a name, which take memory only while they are used."""
+    """Arrays in files without a name, which take memory only while they are used."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path | None = None) -> None:
         self._folder = folder
         self._maps: WeakSet[mmap.mmap] = WeakSet()  # a file goes with the last array in it
 

@@ -185,7 +185,7 @@ def test_path_that_is_turned_as_a_whole_is_turned_back() -> None:
         quaternion_from_matrix(turned @ rotation),
     )
     response = np.concatenate([np.cross(turn * up, away), turn * rotation[:, 2]], axis=1)[..., None]
-    modes = ErrorModes(log.t_ns, response, CONSTANT_M, np.zeros(3), 1.0)
+    modes = ErrorModes(log.t_ns, response, CONSTANT_M)
     first = replace(cameras[0], trajectory=log, modes=modes)
     binding = bind_positions([first, cameras[1]], followed, stills, between=BETWEEN)
     assert binding.bound == ("north", "east")
