@@ -1,6 +1,7 @@
 """Bodies fitted to the skeletons of rendered flights: `python -m benchmarks.accuracy bodies`.
 
-The flights are those of `corpus`, first draw, with the true noise model given, which is none for true poses.
+The flights are those of `corpus` with the true noise model given, which is none for true poses; the default
+network has two draws of the log's errors, every other case one.
 Shape and rotations of the people are known. Where one person is filmed, the body is also fitted with the true
 shape held: keypoints do not show how stout somebody is, so this bounds what they give. Each camera is also
 one by itself, without a stated stature; with true poses once more with the true ground, because the map's
@@ -44,10 +45,12 @@ from pipelines.session.tables import (
 )
 from pipelines.simulation.scenario import Body
 
-CASES: dict[str, tuple[str, Poses, str]] = {
-    "default network": ("blazepose", "logged", "auto"),
-    "heavy, true poses": ("blazepose-heavy", "true", "auto"),
-}
+CASES: tuple[tuple[str, int, str, Poses], ...] = (
+    ("default network", 0, "blazepose", "logged"),
+    ("default network", 1, "blazepose", "logged"),
+    ("heavy, true poses", 0, "blazepose-heavy", "true"),
+)
+"""Name, draw of the log's errors, detector and poses of the cases with all cameras."""
 TRUE_SHAPE = "heavy, true shape"
 ONE_CAMERA: dict[str, tuple[Poses, bool]] = {
     "one camera": ("logged", False),
@@ -105,10 +108,10 @@ def measured(flight: Flight) -> Iterator[tuple[str, BodyErrors]]:
     with tempfile.TemporaryDirectory(prefix="bodies-") as folder:
         drawn = DrawnFlight(flight, Path(folder) / "shared")
         drawn.write_shared()
-        for number, (case, (detector, poses, method)) in enumerate(CASES.items()):
-            session = drawn.session(Path(folder) / str(number), 0, "model", detector, poses=poses)
+        for case, draw, detector, poses in CASES:
+            session = drawn.session(Path(folder) / f"{poses}-{draw}", draw, "model", detector, poses=poses)
             with kept_in_place_of_pictures(flight, detector):
-                reconstruct(session, ReconstructSettings(method=method, detector=detector))  # type: ignore[arg-type]
+                reconstruct(session, ReconstructSettings(detector=detector))
             yield from ((case, errors) for errors in errors_of(session))
         people = drawn.simulated.people
         if len(people) == 1:

@@ -64,7 +64,7 @@ SECTIONS = (
             Part("corpus-nothing", "The corpus, pose noise not stated", RENDERED, KEPT),
             Part("angles", "Joint angles", RENDERED, KEPT),
             Part("corpus-special", "`auto` without each of its special cases", RENDERED, KEPT),
-            Part("bodies", "Bodies with a surface, one draw, noise stated", RENDERED, KEPT),
+            Part("bodies", "Bodies with a surface, noise stated", RENDERED, KEPT),
         ),
     ),
     Section(
