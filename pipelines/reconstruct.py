@@ -92,8 +92,10 @@ from pipelines.reconstruction.refining import (
     doubted_people,
     find_clocks,
     find_wrong_clocks,
+    late_logs,
     refine_flight,
     shifted,
+    with_clocks,
 )
 from pipelines.reconstruction.results import (
     angles_parts,
@@ -145,7 +147,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=56)
+RECONSTRUCT = Stage("reconstruct", revision=57)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -429,7 +431,7 @@ def _counts(metrics: Mapping[str, Any], attempt: Attempt, swaps: Mapping[str, ob
 def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
     cameras = flight.cameras
     if attempt.clocks is not None:
-        cameras = shifted(cameras, attempt.clocks.offset_s)
+        cameras = with_clocks(cameras, attempt.clocks)
     doubts = doubts_of(
         flight.folder,
         flight.description,
@@ -577,7 +579,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
     description, settings = flight.description, flight.settings
     clocks, clock_sigma_s, made = clocks_of(flight, cameras)
     if clocks is not None:
-        cameras = shifted(cameras, clocks.offset_s)
+        cameras = with_clocks(cameras, clocks)
     logged = cameras
     background: dict[str, Any] = {"background": None}
     warnings = [] if clocks is None else clocks.warnings()
@@ -721,7 +723,8 @@ def clocks_of(
 
     A camera that turns has its clock from its background. The others are compared with these by the rays of
     people, or with each other. An offset that all cameras share is estimated from all backgrounds together.
-    Rays of cameras whose mounts nobody knows meet by chance, so backgrounds turn their logs first.
+    Rays of cameras whose mounts nobody knows meet by chance, so backgrounds turn their logs first. People say
+    whether a log is late, or its pictures.
     Return the clocks (None where all are held), their prior standard deviations [C], s, and what was
     triangulated if all were held.
     """
@@ -747,7 +750,14 @@ def clocks_of(
             by = {cameras[c].name: "background" for c in np.flatnonzero(wrong)}
             offset_s, sigma_s = np.where(moved, [offset_s, sigma_s], 0.0)
             clocks = FoundClocks(offset_s, sigma_s, none, wrong=by)
-            cameras, prior_s = shifted(cameras, clocks.offset_s), np.where(known, sigma_s, prior_s)
+            prior_s, as_stated = np.where(known, sigma_s, prior_s), cameras
+            cameras = shifted(cameras, offset_s)
+            if by and len(cameras) > 1:
+                robust = _robust_flight(flight, cameras, _triangulated(flight, cameras), prior_s)
+                clocks = clocks.with_late_logs(
+                    [camera.name for camera in cameras], late_logs(robust, np.where(wrong, offset_s, 0.0))
+                )
+                cameras = with_clocks(as_stated, clocks)
             stated = stated | known
     prior_s = with_reference(description, cameras, prior_s)
     if len(cameras) == 1:  # rays of one camera meet nothing that could show its clock

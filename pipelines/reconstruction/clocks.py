@@ -87,13 +87,21 @@ class FoundClocks:
     prior_s: Float  # [C] prior standard deviation for later estimates; 0 for clocks that are held
     common_sigma_s: float = 0.0  # of an offset that all clocks share, apart from `sigma_s`
     wrong: Mapping[str, str] = field(default_factory=dict)  # evidence against each stated clock that is moved
+    late_logs_s: Mapping[str, float] = field(default_factory=dict)  # to take off the times of logs
     undetermined: tuple[str, ...] = ()  # cameras whose clocks pictures do not determine
 
     def with_others(self, found: FoundClocks) -> FoundClocks:
         """Add the offsets that keypoints show for cameras that these already shift; their deviations stay."""
         sigma_s = np.where(self.sigma_s > 0, self.sigma_s, found.sigma_s)
         wrong = {**found.wrong, **self.wrong}
-        return replace(found, offset_s=self.offset_s + found.offset_s, sigma_s=sigma_s, wrong=wrong)
+        offset_s, logs = self.offset_s + found.offset_s, self.late_logs_s
+        return replace(found, offset_s=offset_s, sigma_s=sigma_s, wrong=wrong, late_logs_s=logs)
+
+    def with_late_logs(self, names: Sequence[str], late: Bool) -> FoundClocks:
+        """Move the logs of some cameras [C] against their pictures, in place of the pictures."""
+        of_log = {name: float(self.offset_s[c]) for c, name in enumerate(names) if late[c]}
+        wrong = {**self.wrong, **dict.fromkeys(of_log, "log")}
+        return replace(self, offset_s=np.where(late, 0.0, self.offset_s), wrong=wrong, late_logs_s=of_log)
 
     def warnings(self) -> list[str]:
         """List clocks that pictures do not determine: nobody moved, or straight camera paths compensate."""
@@ -111,8 +119,9 @@ class FoundClocks:
             "clock_offset_sigmas_s": dict(zip(names, sigmas, strict=True)),
         }
         if self.wrong:
+            moved_s = offset_s | {name: -late_s for name, late_s in self.late_logs_s.items()}
             found["clocks_moved"] = {
-                name: {"offset_s": offset_s[name], "sigma_s": found["clock_offset_sigmas_s"][name], "by": by}
+                name: {"offset_s": moved_s[name], "sigma_s": found["clock_offset_sigmas_s"][name], "by": by}
                 for name, by in self.wrong.items()
             }
         return found
@@ -219,6 +228,16 @@ def wrong_clocks(views_at: Callable[[float], Views], t_s: Float, questioned: Boo
         if abs(found_s) >= MIN_OFFSET_BY_PEOPLE_S:
             offset_s[chosen], current = found_s, _with_camera(current, at[found_s], chosen)
     return offset_s
+
+
+def meet_better(views: Views, other: Views, t_s: Float, camera: int) -> bool:
+    """Test if the rays of a camera meet the others clearly better in other views, at times `t_s` [T]."""
+    missed = [_missed_px(each, len(t_s), camera) for each in (views, other)]
+    if min(map(len, missed)) < FEWEST_TIMES:
+        return False
+    before, after = (_changing_px(each, _window(t_s)) for each in missed)
+    count = _independent(missed[1])
+    return bool(2 * count * np.log(before / after) > MIN_CONTRAST * np.sqrt(2 * count))
 
 
 def _independent(missed: Float) -> float:

@@ -19,9 +19,6 @@ from pipelines.session.records import Trajectory
 
 # --- tuning ---
 
-# Poses at 5 Hz that are repeated in between are near enough to the truth. Frozen ones are equal for longer.
-LEAST_FROZEN_S = 0.3
-
 # The least step (m, rad) after equal poses, and of a jump: noise of logs that are rounded is smaller.
 LEAST_STEP = (0.05, float(np.radians(0.5)))
 LEAST_JUMP = (0.5, float(np.radians(5.0)))
@@ -60,7 +57,7 @@ def mend(log: Trajectory) -> Mended:
     turns = rotation_vector_from_quaternion(multiply(quaternion[:-1] * [-1, -1, -1, 1], quaternion[1:]))
     turns[(quaternion[1:] == quaternion[:-1]).all(axis=1)] = 0.0
     for kind, steps in enumerate((np.diff(log.position, axis=0), turns)):
-        stretches = _frozen(log.t_ns, steps, LEAST_STEP[kind])
+        stretches = _frozen(steps, LEAST_STEP[kind])
         away = _jumps(log.t_ns, steps, LEAST_JUMP[kind])
         counts += [len(stretches), len(away)]
         for before, after in [*stretches, *away]:
@@ -76,15 +73,11 @@ def mend(log: Trajectory) -> Mended:
     return Mended(bridged, loosened, int(counts[0]), int(counts[1]), poses, longest_s)
 
 
-def _frozen(t_ns: Int64, steps: Float, least: float) -> list[tuple[int, int]]:
+def _frozen(steps: Float, least: float) -> list[tuple[int, int]]:
     """Find the pose that is repeated and the first one after it, of every stretch of equal poses."""
     size = np.linalg.norm(steps, axis=1)
     edges = np.flatnonzero(np.diff(size == 0.0, prepend=False, append=False)).reshape(-1, 2)
-    return [
-        (int(first), int(last) + 1)
-        for first, last in edges
-        if last < len(size) and t_ns[last] - t_ns[first] > 1e9 * LEAST_FROZEN_S and size[last] >= least
-    ]
+    return [(int(first), int(last) + 1) for first, last in edges if last < len(size) and size[last] >= least]
 
 
 def _jumps(t_ns: Int64, steps: Float, least: float) -> list[tuple[int, int]]:
@@ -135,5 +128,5 @@ def warnings_of_stretches(name: str, mended: Mended) -> list[str]:
     ]
     return [
         f"{name}: its log has {' and '.join(what)}, for up to {mended.longest_s:.2f} s:"
-        f" {mended.poses} poses are interpolated over them and hardly count"
+        f" {mended.poses} poses are interpolated over them and count less"
     ]

@@ -43,6 +43,7 @@ from pipelines.reconstruction.clocks import (
     QUESTIONED_SIGMA_S,
     SEARCH_STEP_S,
     FoundClocks,
+    meet_better,
     searched_offsets_s,
     wrong_clocks,
 )
@@ -288,6 +289,22 @@ def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, refere
     )
 
 
+def late_logs(flight: RobustFlight, offset_s: Float) -> Bool:
+    """Find the cameras [C] whose log is late, and not their pictures.
+
+    Their pictures were moved by `offset_s` [C], 0 for others, until backgrounds turn as logs do. So they do
+    with the log moved back; then the rays of people meet the others at the stated times.
+    """
+    late, held = np.zeros((2, len(offset_s)), dtype=np.bool_)
+    views_at, rows = _views_at(flight, held)
+    for c in np.flatnonzero(offset_s).tolist():
+        cameras = shifted(flight.cameras, np.where(np.arange(len(late)) == c, -offset_s, 0.0))
+        cameras[c] = _with_log_at(cameras[c], float(offset_s[c]))
+        other_at, _ = _views_at(replace(flight, cameras=cameras), held)
+        late[c] = meet_better(views_at(0.0), other_at(0.0), flight.t_s[rows], c)
+    return late
+
+
 def _views_at(flight: RobustFlight, moved: Bool) -> tuple[Callable[[float], Views], slice]:
     """Return a function from a shift (s) of some clocks [C] to views at some times, and these."""
     times = len(flight.observations.t_ns)
@@ -432,6 +449,18 @@ def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
         replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
         for camera, offset in zip(cameras, offset_s, strict=True)
     ]
+
+
+def with_clocks(cameras: Sequence[Camera], clocks: FoundClocks) -> list[Camera]:
+    """Return the cameras with the found clocks of their pictures, and of their logs."""
+    late_s = clocks.late_logs_s
+    moved = shifted(cameras, clocks.offset_s)
+    return [_with_log_at(c, late_s[c.name]) if c.name in late_s else c for c in moved]
+
+
+def _with_log_at(camera: Camera, late_s: float) -> Camera:
+    log = camera.trajectory
+    return replace(camera, trajectory=replace(log, t_ns=log.t_ns - round(1e9 * late_s)))
 
 
 def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:

@@ -633,15 +633,16 @@ def poses_table(cameras: Sequence[Camera], poses: Sequence[tuple[Float, Float]])
     return pd.concat(parts, ignore_index=True)
 
 
-# Mean error over the root mean square that the covariances predict: quantiles 0.1, 0.5 and 0.9 over 179
+# Mean error over the root mean square that the covariances predict: quantiles 0.07, 0.5 and 0.93 of 179
 # flights with truth (near, far, opposite, high, two and three cameras), by where the errors of poses are
-# known from; the geometry is in the covariances. A mean of lengths is 0.92 of their root mean square. Errors
-# of a log's own covariances may last or not; where nobody states errors, they may also be far from usual.
+# known from; those of 19 to 60 flights hold 80 % of others. The geometry is in the covariances. A mean of
+# lengths is 0.92 of their root mean square. Errors of a log's own covariances may last or not; where nobody
+# states errors, they may also be far from usual.
 ERROR_OVER_PREDICTED = {
-    "none": (0.25, 0.55, 1.0),
-    "stated": (0.48, 0.66, 1.35),
-    "logged": (0.38, 0.87, 1.5),
-    "estimated": (0.30, 0.55, 2.6),
+    "none": (0.24, 0.55, 0.95),
+    "stated": (0.45, 0.66, 1.36),
+    "logged": (0.34, 0.87, 1.53),
+    "estimated": (0.28, 0.55, 3.9),
 }
 # Three cameras and more agree better than their covariances say: each errs by itself, by what it can err.
 OF_MORE_THAN_TWO = 0.8

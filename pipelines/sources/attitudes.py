@@ -75,9 +75,11 @@ MAP_FILES = ("picture_map.parquet", "picture_map_sightings.parquet")
 # A satellite receiver's error decorrelates in minutes (docs/flight.md, Poses).
 SATELLITE_CORRELATION_S = 100.0
 
-# The mean attitude is free by so many of its standard deviations, and that of each picture by this much (maps
-# bend by less): then pictures that both the map and the estimate use hardly count twice.
-FREE_SIGMAS, FREE_DEG = 3.0, 1.0
+# The mean attitude is free by so many of its standard deviations: places and pictures, which the estimate
+# uses as well, hardly count twice.
+FREE_SIGMAS = 3.0
+# Maps of six seconds bend until they are off by 0.3 deg (rendered flights): a random walk, deg / sqrt(s).
+BENT_DEG_PER_SQRT_S = 0.1
 
 # A log's attitude that is further from the pictures' one is said: gimbals and compasses err by less.
 MAX_UNLIKE_DEG = 15.0
@@ -403,8 +405,8 @@ def _with_rotation(
 ) -> dict[str, dict[str, float | str]]:
     """Return stated noise models of places with that of attitudes: as found from photographs.
 
-    Of a film, whose points are `followed`, it says next to nothing. The estimate weighs the same points and
-    places, and what the map says follows from these: it would count twice.
+    Of a film, whose points are `followed`, the constant part says next to nothing: the estimate weighs the
+    same points and places, from which it follows, and it would count twice. And maps bend.
     """
     if stated is None:
         stated = {"white": {"position_m": round(laid.residual_m, 4)}, "bias": {"position_m": UNSTATED_BIAS_M}}
@@ -415,7 +417,7 @@ def _with_rotation(
     common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
     if followed:
         common_deg = float(np.hypot(FREE_SIGMAS * common_deg, LEVEL_SIGMA_DEG))
-        picture_deg = float(np.hypot(picture_deg, FREE_DEG))
+        merged.setdefault("drift", {})["rotation_deg_per_sqrt_s"] = BENT_DEG_PER_SQRT_S
     for model, sigma_deg in (("bias", common_deg), ("white", picture_deg)):
         merged.setdefault(model, {})["rotation_deg"] = round(sigma_deg, 4)
     return merged

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import Bias, NoiseModel, White, pose_errors
 from pipelines.geometry.triangulation import Views
-from pipelines.reconstruction.clocks import searched_offsets_s
+from pipelines.reconstruction.clocks import meet_better, searched_offsets_s
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from pipelines.reconstruction.refinement.system import Sighting
 from tests.reconstruction.formations import BONES, FOCAL_PX, Formation, formation
@@ -77,6 +77,18 @@ def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: floa
     found = searched_offsets(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
     assert found[0] == 0.0
     np.testing.assert_allclose(found[1:], [late_s, 0.0], atol=STEP_S)
+
+
+def test_rays_say_whether_pictures_or_their_log_are_late() -> None:
+    late, rng = np.array([False, True, False]), np.random.default_rng(0)
+    walking = formation(TIMES, 3, ROUGH, 1)
+    right, wrong = (seen(walking, shift_s, late) for shift_s in (0.0, 0.2))
+    assert meet_better(wrong, right, walking.t_s, 1)
+    assert not meet_better(right, wrong, walking.t_s, 1)
+    noise = rng.normal(0, 2 / FOCAL_PX, (2, *right.rays.shape))
+    here, there = (replace(right, rays=right.rays + each) for each in noise)
+    assert not meet_better(here, there, walking.t_s, 1)
+    assert not meet_better(there, here, walking.t_s, 1)
 
 
 def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:

@@ -155,17 +155,22 @@ def doubts_of(
 
 def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, float | str]]) -> list[Doubt]:
     """State which clocks were moved against what is stated of them, and by what evidence."""
-    evidence = {"background": "the turning of their background shows", "keypoints": "the people in them show"}
+    background = "the turning of their background"
+    evidence = {"background": f"{background} shows", "keypoints": "the people in them show"}
+    evidence |= {"log": f"{background} and the people in all pictures show"}
     doubts = []
     for name, found in moved.items():
         late_s, sigma_s = float(found["offset_s"]), float(found["sigma_s"])
         offset_s = description.cameras[name].clock.offset_s + late_s
         either = found["by"] == "keypoints" and len(description.cameras) == 2
         beside = ", though the other camera's clock may be the wrong one" if either else ""
-        what = f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}, as"
-        what += f" {evidence[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}"
+        what = f"the pictures of {name} were taken {remedies.earlier_or_later(late_s)}"
+        if found["by"] == "log":
+            side = "late" if late_s < 0 else "early"
+            what = f"the times of the log of {name} are {abs(late_s):.3f} s too {side}"
+        what += f", as {evidence[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}"
         known = {"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)}
-        remedy = "" if beside else f"cameras.{name}.clock.offset_s: {offset_s:.3f}"
+        remedy = "" if beside or found["by"] == "log" else f"cameras.{name}.clock.offset_s: {offset_s:.3f}"
         doubts.append(Doubt(code="clock", cameras=[name], what=what, evidence=dict(known), remedy=remedy))
     return doubts
 
