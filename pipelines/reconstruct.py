@@ -754,10 +754,9 @@ def clocks_of(
             cameras = shifted(cameras, offset_s)
             if by and len(cameras) > 1:
                 robust = _robust_flight(flight, cameras, _triangulated(flight, cameras), prior_s)
-                clocks = clocks.with_late_logs(
-                    [camera.name for camera in cameras], late_logs(robust, np.where(wrong, offset_s, 0.0))
-                )
-                cameras = with_clocks(as_stated, clocks)
+                of_log = late_logs(robust, np.where(wrong, offset_s, 0.0), exact | known)
+                clocks = clocks.with_late_logs([camera.name for camera in cameras], of_log)
+                cameras, prior_s = with_clocks(as_stated, clocks), np.where(of_log, 0.0, prior_s)
             stated = stated | known
     prior_s = with_reference(description, cameras, prior_s)
     if len(cameras) == 1:  # rays of one camera meet nothing that could show its clock
@@ -860,7 +859,7 @@ def _clock_metrics(
             for part in ("clock_offsets_s", "clock_offset_sigmas_s")
         )
         offset_s = offset_s + later
-        sigma_s = sigmas if sigmas.any() else sigma_s  # else they were held
+        sigma_s = np.where(sigmas > 0, sigmas, sigma_s)  # others were held
     return replace(clocks, offset_s=offset_s, sigma_s=sigma_s).as_metrics(names)
 
 

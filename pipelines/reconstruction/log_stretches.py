@@ -19,7 +19,7 @@ from pipelines.session.records import Trajectory
 
 # --- tuning ---
 
-# The least step (m, rad) after equal poses, and of a jump: noise of logs that are rounded is smaller.
+# The least step (m, rad) after equal poses, and of a jump: noise of logs that are rounded to cm is smaller.
 LEAST_STEP = (0.05, float(np.radians(0.5)))
 LEAST_JUMP = (0.5, float(np.radians(5.0)))
 
@@ -60,12 +60,14 @@ def mend(log: Trajectory) -> Mended:
         stretches = _frozen(steps, LEAST_STEP[kind])
         away = _jumps(log.t_ns, steps, LEAST_JUMP[kind])
         counts += [len(stretches), len(away)]
-        for before, after in [*stretches, *away]:
+        # A log that stands, and then steps a little, was never further away than that.
+        sizes = [float(np.linalg.norm(steps[after - 1])) for _, after in stretches]
+        for (before, after), most in zip([*stretches, *away], [*sizes, *len(away) * [np.inf]], strict=True):
             inside = slice(before + 1, after)
             span_s = float(log.t_ns[after] - log.t_ns[before]) / 1e9
             longest_s = max(longest_s, span_s)
             bridged = _bridged(bridged, before, after, kind)
-            sigma = min(LEFT_IN_A_SECOND[kind] * span_s**2, MOST_SIGMA[kind])
+            sigma = min(LEFT_IN_A_SECOND[kind] * span_s**2, most, MOST_SIGMA[kind])
             loosened[inside, kind] = np.maximum(loosened[inside, kind], sigma)
     poses = int((loosened > 0).any(axis=1).sum())
     if not poses:

@@ -210,10 +210,10 @@ def candidates(cameras: list[Camera], between: Interpolation) -> Candidates:
         own_rays, own_confidence = camera.seen()
         rays[near, c, : camera.most_people] = own_rays[frame[near, c]]
         confidence[near, c, : camera.most_people] = own_confidence[frame[near, c]]
-    return Candidates(t_ns, frame, rays, confidence, *_poses_at(cameras, t_ns, between))
+    return Candidates(t_ns, frame, rays, confidence, *poses_of_cameras(cameras, t_ns, between))
 
 
-def _poses_at(cameras: list[Camera], t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
+def poses_of_cameras(cameras: list[Camera], t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
     """Interpolate world_from_camera of all cameras: position [T, C, 3], rotation [T, C, 3, 3]."""
     poses = [camera.poses_at(t_ns, between) for camera in cameras]
     position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
@@ -234,7 +234,7 @@ def observe(
     if (found.t_ns[rows] == t_ns).all():
         position, rotation = found.position[rows], found.rotation[rows]
     else:
-        position, rotation = _poses_at(cameras, t_ns, between)
+        position, rotation = poses_of_cameras(cameras, t_ns, between)
     stated = [sigma for sigma in sigmas if sigma is not None]
     pose_sigma = _all_sigmas(cameras, sigmas) if stated else None
     return Observations(

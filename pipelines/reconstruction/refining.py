@@ -53,6 +53,7 @@ from pipelines.reconstruction.observations import (
     Observations,
     observe,
     on_sides,
+    poses_of_cameras,
     sightings_of,
 )
 from pipelines.reconstruction.one_camera import STATED_STATURE_SIGMA_M, STATURE_M
@@ -289,19 +290,29 @@ def find_wrong_clocks(flight: RobustFlight, questioned: Bool, held: Bool, refere
     )
 
 
-def late_logs(flight: RobustFlight, offset_s: Float) -> Bool:
-    """Find the cameras [C] whose log is late, and not their pictures.
+def late_logs(flight: RobustFlight, offset_s: Float, known: Bool) -> Bool:
+    """Find the cameras [C] whose log is late, or early, and not their pictures.
 
     Their pictures were moved by `offset_s` [C], 0 for others, until backgrounds turn as logs do. So they do
-    with the log moved back; then the rays of people meet the others at the stated times.
+    with the log moved back; then the rays of people meet those of cameras with `known` clocks [C] better.
+    All of them are tried together first, then one after the other.
     """
     late, held = np.zeros((2, len(offset_s)), dtype=np.bool_)
+    suspects = offset_s != 0
+    if known.sum() < 2:
+        return late
     views_at, rows = _views_at(flight, held)
-    for c in np.flatnonzero(offset_s).tolist():
-        cameras = shifted(flight.cameras, np.where(np.arange(len(late)) == c, -offset_s, 0.0))
-        cameras[c] = _with_log_at(cameras[c], float(offset_s[c]))
-        other_at, _ = _views_at(replace(flight, cameras=cameras), held)
-        late[c] = meet_better(views_at(0.0), other_at(0.0), flight.t_s[rows], c)
+    now = views_at(0.0).of(known)
+    for group in (suspects, *(np.eye(len(late), dtype=np.bool_)[suspects] if suspects.sum() > 1 else ())):
+        moved_s = np.where(group, offset_s, 0.0)
+        cameras = with_late_logs(shifted(flight.cameras, -moved_s), moved_s)
+        position, rotation = poses_of_cameras(cameras, flight.found.t_ns, flight.between)
+        found = replace(flight.found, position=position, rotation=rotation)
+        other_at, _ = _views_at(replace(flight, cameras=cameras, found=found), held)
+        first = int(np.count_nonzero(known[: int(group.argmax())]))
+        late |= group & meet_better(now, other_at(0.0).of(known), flight.t_s[rows], first)
+        if late[suspects].all():
+            break
     return late
 
 
@@ -453,14 +464,17 @@ def shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
 
 def with_clocks(cameras: Sequence[Camera], clocks: FoundClocks) -> list[Camera]:
     """Return the cameras with the found clocks of their pictures, and of their logs."""
-    late_s = clocks.late_logs_s
-    moved = shifted(cameras, clocks.offset_s)
-    return [_with_log_at(c, late_s[c.name]) if c.name in late_s else c for c in moved]
+    late_s = np.array([clocks.late_logs_s.get(camera.name, 0.0) for camera in cameras])
+    return with_late_logs(shifted(cameras, clocks.offset_s), late_s)
 
 
-def _with_log_at(camera: Camera, late_s: float) -> Camera:
-    log = camera.trajectory
-    return replace(camera, trajectory=replace(log, t_ns=log.t_ns - round(1e9 * late_s)))
+def with_late_logs(cameras: Sequence[Camera], late_s: Float) -> list[Camera]:
+    """Return the cameras with the times of their logs moved back by [C] s."""
+    logs = [
+        replace(camera.trajectory, t_ns=camera.trajectory.t_ns - round(1e9 * seconds))
+        for camera, seconds in zip(cameras, late_s.tolist(), strict=True)
+    ]
+    return [replace(camera, trajectory=log) for camera, log in zip(cameras, logs, strict=True)]
 
 
 def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:

@@ -78,7 +78,7 @@ SATELLITE_CORRELATION_S = 100.0
 # The mean attitude is free by so many of its standard deviations: places and pictures, which the estimate
 # uses as well, hardly count twice.
 FREE_SIGMAS = 3.0
-# Maps of six seconds bend until they are off by 0.3 deg (rendered flights): a random walk, deg / sqrt(s).
+# Maps of films bend by this random walk, deg per root second; chosen on three rendered flights.
 BENT_DEG_PER_SQRT_S = 0.1
 
 # A log's attitude that is further from the pictures' one is said: gimbals and compasses err by less.
@@ -406,7 +406,7 @@ def _with_rotation(
     """Return stated noise models of places with that of attitudes: as found from photographs.
 
     Of a film, whose points are `followed`, the constant part says next to nothing: the estimate weighs the
-    same points and places, from which it follows, and it would count twice. And maps bend.
+    same points and places, from which it follows, and it would count twice. And maps bend, slowly.
     """
     if stated is None:
         stated = {"white": {"position_m": round(laid.residual_m, 4)}, "bias": {"position_m": UNSTATED_BIAS_M}}
@@ -417,7 +417,8 @@ def _with_rotation(
     common_deg, picture_deg = np.degrees([laid.common_sigma_rad, laid.picture_sigma_rad]).tolist()
     if followed:
         common_deg = float(np.hypot(FREE_SIGMAS * common_deg, LEVEL_SIGMA_DEG))
-        merged.setdefault("drift", {})["rotation_deg_per_sqrt_s"] = BENT_DEG_PER_SQRT_S
+        bent = merged.setdefault("gauss-markov", {"correlation_s": SATELLITE_CORRELATION_S})
+        bent["rotation_deg"] = round(BENT_DEG_PER_SQRT_S * (float(bent["correlation_s"]) / 2) ** 0.5, 4)
     for model, sigma_deg in (("bias", common_deg), ("white", picture_deg)):
         merged.setdefault(model, {})["rotation_deg"] = round(sigma_deg, 4)
     return merged

@@ -11,10 +11,13 @@ from scipy.stats import t
 
 from pipelines.geometry.arrays import Intrinsics
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
+from pipelines.reconstruction.clocks import FoundClocks
 from pipelines.reconstruction.loading import PoseDisturbance, disturbed
 from pipelines.reconstruction.observations import Camera, Candidates
+from pipelines.reconstruction.refining import with_clocks
 from pipelines.reconstruction.results import GOOD_MM, USABLE_MM, summary_of_trials, verdict
 from pipelines.reconstruction.solving import placed_by_size
+from pipelines.session.description import Interpolation
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections, Trajectory
 
@@ -51,6 +54,26 @@ def test_each_camera_and_trial_has_its_own_chance_whatever_else_is_asked() -> No
     assert not np.allclose(two, moved("white:position_m=0.1", seed=1))
     # Latency does not change a camera that stands still.
     assert not moved("latency:latency_ms=50").any()
+
+
+def test_a_late_log_moves_against_its_pictures() -> None:
+    """Stamp a log that moves by 1 m/s 0.2 s too late: its camera is 0.2 m further on than it says."""
+    names, none = ("late", "early", "late film"), np.zeros(3)
+    moving = [replace(camera(name), frame_t_ns=np.array([2 * 10**8])) for name in names]
+    logs = [replace(each.trajectory, position=np.arange(5)[:, None] * [0.1, 0, 0]) for each in moving]
+    moving = [replace(each, trajectory=log) for each, log in zip(moving, logs, strict=True)]
+    found = FoundClocks(
+        np.array([0.2, -0.1, 0.2]), np.full(3, 0.01), none, wrong=dict.fromkeys(names, "background")
+    )
+    clocks = found.with_late_logs(names, np.array([True, True, False]))
+    assert clocks.wrong == {"late": "log", "early": "log", "late film": "background"}
+    after = with_clocks(moving, clocks.with_others(FoundClocks(none, none, none)))
+    assert [each.frame_t_ns[0] / 1e9 for each in after] == [0.2, 0.2, 0.4]
+    between = Interpolation(max_gap_ns=10**9, max_extrapolation_ns=10**9)
+    at = [each.poses_at(each.frame_t_ns, between)[0][0, 0] for each in after]
+    np.testing.assert_allclose(at, [0.4, 0.1, 0.4], atol=1e-9)
+    shown = clocks.as_metrics(names)["clocks_moved"]
+    assert [shown[name]["offset_s"] for name in names] == [-0.2, 0.1, 0.2]
 
 
 def test_cameras_that_are_metres_off_start_where_people_have_their_size() -> None:

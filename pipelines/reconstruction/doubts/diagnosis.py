@@ -169,7 +169,8 @@ def doubts_of_clocks(description: Description, moved: Mapping[str, Mapping[str, 
             side = "late" if late_s < 0 else "early"
             what = f"the times of the log of {name} are {abs(late_s):.3f} s too {side}"
         what += f", as {evidence[str(found['by'])]} (sigma {sigma_s:.3f} s); the estimate uses that{beside}"
-        known = {"clock_s": round(late_s, 3), "clock_sigma_s": round(sigma_s, 3)}
+        clock = "log_clock" if found["by"] == "log" else "clock"
+        known = {f"{clock}_s": round(late_s, 3), f"{clock}_sigma_s": round(sigma_s, 3)}
         remedy = "" if beside or found["by"] == "log" else f"cameras.{name}.clock.offset_s: {offset_s:.3f}"
         doubts.append(Doubt(code="clock", cameras=[name], what=what, evidence=dict(known), remedy=remedy))
     return doubts
