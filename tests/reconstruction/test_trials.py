@@ -69,7 +69,7 @@ def test_a_late_log_moves_against_its_pictures() -> None:
     assert clocks.wrong == {"late": "log", "early": "log", "late film": "background"}
     after = with_clocks(moving, clocks.with_others(FoundClocks(none, none, none)))
     assert [each.frame_t_ns[0] / 1e9 for each in after] == [0.2, 0.2, 0.4]
-    between = Interpolation(max_gap_ns=10**9, max_extrapolation_ns=10**9)
+    between = Interpolation(max_gap_s=1.0, max_extrapolation_s=1.0)
     at = [each.poses_at(each.frame_t_ns, between)[0][0, 0] for each in after]
     np.testing.assert_allclose(at, [0.4, 0.1, 0.4], atol=1e-9)
     shown = clocks.as_metrics(names)["clocks_moved"]
