@@ -5,7 +5,8 @@ poses that are repeated are wrong as soon as the camera moves on. They are bridg
 last pose before and the first one after, and loosened by how far a drone may leave that line meanwhile.
 Positions and rotations are judged apart, as they come from different sensors.
 
-A camera that stands, or hovers, repeats no pose before a jump, and is left as it is.
+A camera that stands, or hovers, takes no such step, and is left as it is. Where a log is rounded to more than
+`LEAST_STEP` it does; its poses are then loosened by no more than the step.
 """
 
 from dataclasses import dataclass, replace

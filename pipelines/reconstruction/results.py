@@ -637,8 +637,8 @@ def poses_table(cameras: Sequence[Camera], poses: Sequence[tuple[Float, Float]])
 # flights with truth (near, far, opposite, high, two and three cameras), by where the errors of poses are
 # known from; those of 19 to 60 flights hold 80 % of others. The geometry is in the covariances. A mean of
 # lengths is 0.92 of their root mean square. Errors of a log's own covariances may last or not; where nobody
-# states errors, they may also be far from usual. One camera sees no depth: those before, wider.
-# `python -m benchmarks.mistakes --expected 180 --seed 1002` prints errors and intervals.
+# states errors, they may also be far from usual. One camera sees no depth: its interval is wider, and was
+# not calibrated. Errors and intervals: `python -m benchmarks.mistakes --expected 180 --seed 1002`.
 ERROR_OVER_PREDICTED = {
     "none": (0.24, 0.55, 0.95),
     "stated": (0.45, 0.66, 1.36),

@@ -107,7 +107,7 @@ class TurnedByPictures:
 
     trajectory: Trajectory
     intrinsics: Intrinsics  # with the focal length of the map, if that was refined
-    pose_noise: dict[str, dict[str, float | str]]  # of places as stated, of attitudes as found
+    pose_noise: dict[str, dict[str, float | str]]  # of places as stated, of attitudes for the estimate
     map: PictureMap
     entry: PictureMapEntry
 
