@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,9 @@ LEAST_SHARE_OF_TIMES = 0.5
 FINE_STEP_S = 1 / 60
 # So many fine steps on each side reach over to the neighbouring coarse ones.
 FINE_STEPS = 3
+
+# Of so many suspects all sets are tried.
+MOST_IN_SETS = 3
 
 # Of two cameras, a shift of either explains the same. Within this factor, the reference's clock is right.
 ALIKE_RATIO = 1.05
@@ -230,14 +234,27 @@ def wrong_clocks(views_at: Callable[[float], Views], t_s: Float, questioned: Boo
     return offset_s
 
 
-def meet_better(views: Views, other: Views, t_s: Float, camera: int) -> bool:
-    """Test if the rays of a camera meet the others clearly better in other views, at times `t_s` [T]."""
-    missed = [_missed_px(each, len(t_s), camera) for each in (views, other)]
-    if min(map(len, missed)) < FEWEST_TIMES:
-        return False
-    before, after = (_changing_px(each, _window(t_s)) for each in missed)
-    count = _independent(missed[1])
-    return bool(2 * count * np.log(before / after) > MIN_CONTRAST * np.sqrt(2 * count))
+def meeting_best(views_with: Callable[[Bool], Views], suspects: Bool, t_s: Float) -> Bool:
+    """Find the `suspects` [C] with whose change the rays of people meet best, none if not clearly.
+
+    `views_with` returns the views after a change of some [C] of them, at the times `t_s` [T]. All sets of
+    suspects are tried; of many suspects each one and all together.
+    """
+    (among,) = np.nonzero(suspects)
+    none = np.zeros_like(suspects)
+    before, best, most = views_with(none), none, MIN_CONTRAST
+    sizes = range(1, len(among) + 1) if len(among) <= MOST_IN_SETS else (1, len(among))
+    for some in chain.from_iterable(combinations(among.tolist(), size) for size in sizes):
+        changed = none.copy()
+        changed[list(some)] = True
+        missed = [_missed_px(each, len(t_s), some[0]) for each in (before, views_with(changed))]
+        if min(map(len, missed)) < FEWEST_TIMES:
+            continue
+        old, new = (_changing_px(each, _window(t_s)) for each in missed)
+        count = _independent(missed[1])
+        gain = 2 * count * np.log(old / new) / np.sqrt(2 * count)  # by what chance does
+        best, most = (changed, gain) if gain > most else (best, most)
+    return best
 
 
 def _independent(missed: Float) -> float:

@@ -43,7 +43,7 @@ from pipelines.reconstruction.clocks import (
     QUESTIONED_SIGMA_S,
     SEARCH_STEP_S,
     FoundClocks,
-    meet_better,
+    meeting_best,
     searched_offsets_s,
     wrong_clocks,
 )
@@ -295,24 +295,22 @@ def late_logs(flight: RobustFlight, offset_s: Float, known: Bool) -> Bool:
 
     Their pictures were moved by `offset_s` [C], 0 for others, until backgrounds turn as logs do. So they do
     with the log moved back; then the rays of people meet those of cameras with `known` clocks [C] better.
-    All of them are tried together first, then one after the other.
     """
-    late, held = np.zeros((2, len(offset_s)), dtype=np.bool_)
-    suspects = offset_s != 0
+    held = np.zeros(len(offset_s), dtype=np.bool_)
     if known.sum() < 2:
-        return late
-    views_at, rows = _views_at(flight, held)
-    now = views_at(0.0).of(known)
-    for group in (suspects, *(np.eye(len(late), dtype=np.bool_)[suspects] if suspects.sum() > 1 else ())):
-        moved_s = np.where(group, offset_s, 0.0)
+        return held
+    times_s = flight.t_s[_views_at(flight, held)[1]]
+
+    def views_with(late: Bool) -> Views:
+        moved_s = np.zeros(len(known))
+        moved_s[known] = np.where(late, offset_s[known], 0.0)
         cameras = with_late_logs(shifted(flight.cameras, -moved_s), moved_s)
         position, rotation = poses_of_cameras(cameras, flight.found.t_ns, flight.between)
         found = replace(flight.found, position=position, rotation=rotation)
-        other_at, _ = _views_at(replace(flight, cameras=cameras, found=found), held)
-        first = int(np.count_nonzero(known[: int(group.argmax())]))
-        late |= group & meet_better(now, other_at(0.0).of(known), flight.t_s[rows], first)
-        if late[suspects].all():
-            break
+        return _views_at(replace(flight, cameras=cameras, found=found), held)[0](0.0).of(known)
+
+    late = held.copy()
+    late[known] = meeting_best(views_with, offset_s[known] != 0, times_s)
     return late
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.noise import Bias, NoiseModel, White, pose_errors
 from pipelines.geometry.triangulation import Views
-from pipelines.reconstruction.clocks import meet_better, searched_offsets_s
+from pipelines.reconstruction.clocks import meeting_best, searched_offsets_s
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from pipelines.reconstruction.refinement.system import Sighting
 from tests.reconstruction.formations import BONES, FOCAL_PX, Formation, formation
@@ -79,16 +79,23 @@ def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: floa
     np.testing.assert_allclose(found[1:], [late_s, 0.0], atol=STEP_S)
 
 
-def test_rays_say_whether_pictures_or_their_log_are_late() -> None:
-    late, rng = np.array([False, True, False]), np.random.default_rng(0)
-    walking = formation(TIMES, 3, ROUGH, 1)
-    right, wrong = (seen(walking, shift_s, late) for shift_s in (0.0, 0.2))
-    assert meet_better(wrong, right, walking.t_s, 1)
-    assert not meet_better(right, wrong, walking.t_s, 1)
-    noise = rng.normal(0, 2 / FOCAL_PX, (2, *right.rays.shape))
-    here, there = (replace(right, rays=right.rays + each) for each in noise)
-    assert not meet_better(here, there, walking.t_s, 1)
-    assert not meet_better(there, here, walking.t_s, 1)
+@pytest.mark.parametrize("of_log", [[1], [2], [1, 2], []])
+def test_rays_say_of_two_cameras_whether_pictures_or_their_log_are_late(of_log: list[int]) -> None:
+    """Pictures are 0.2 s off where they were moved and the log is late, or the other way about."""
+    truth, suspects = np.isin(np.arange(4), of_log), np.array([False, True, True, False])
+    walking = formation(TIMES, 4, ROUGH, 1)
+    found = meeting_best(lambda late: seen(walking, 0.2, late ^ truth), suspects, walking.t_s)
+    assert found.tolist() == truth.tolist()
+
+
+def test_chance_says_nothing_of_late_logs() -> None:
+    walking, rng = formation(TIMES, 3, ROUGH, 1), np.random.default_rng(0)
+    right = seen(walking, 0.0, np.zeros(3, dtype=np.bool_))
+
+    def with_errors(_: Bool) -> Views:
+        return replace(right, rays=right.rays + rng.normal(0, 2 / FOCAL_PX, right.rays.shape))
+
+    assert not meeting_best(with_errors, np.array([False, True, True]), walking.t_s).any()
 
 
 def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:
