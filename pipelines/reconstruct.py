@@ -905,7 +905,7 @@ def find_people(
 ) -> tuple[Candidates, Association, Float]:
     """Collect all detections at common times, associate them with people, logged first; see `ray_sigma`."""
     found = candidates(cameras, between)
-    sigma = ray_sigma(cameras, found.t_ns, found.position)
+    sigma = ray_sigma(cameras, found)
     time_s = (found.t_ns - found.t_ns[0]) / 1e9
     views = SightLines(found.rays, found.confidence, found.position, found.rotation, sigma)
     logged = np.stack([actor.hips_at(found.t_ns) for actor in actors], axis=1) if actors else None

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64, known_median
 from pipelines.geometry.noise import ROTATION, UNKNOWN_SIGMA, PoseErrors
 from pipelines.geometry.triangulation import (
     PIXEL_SIGMA_PX,
@@ -30,13 +30,17 @@ from pipelines.geometry.triangulation import (
 from pipelines.reconstruction.observations import Camera, Candidates, Observations
 from pipelines.session.errors import NoViewsError
 
+# Weight of the middle of all cameras against a line of sight: rays some 10 degrees apart say as much.
+AMID_SHARE = 0.01
 
-def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float) -> Float:
-    """Compute the standard deviation [T, C] rad of rays, to people taken to be amid the cameras."""
+
+def ray_sigma(cameras: Sequence[Camera], found: Candidates) -> Float:
+    """Compute the standard deviation [T, C] rad of rays, to people taken to be where the cameras look."""
+    t_ns, position = found.t_ns, found.position
     posed = ~np.isnan(position[..., 0])
     if not posed.any():
         raise NoViewsError("the cameras", "have no pose at any picture", "check clocks and pose logs")
-    middle = position[posed].mean(axis=0)
+    middle = _looked_at(found, position[posed].mean(axis=0))
     columns = []
     for c, camera in enumerate(cameras):
         stated = camera.sigma_at(t_ns)
@@ -46,6 +50,20 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float) -> Float:
         pixel = PIXEL_SIGMA_PX / camera.focal_px
         columns.append(np.sqrt(pixel**2 + sigma[:, 1] ** 2 + (sigma[:, 0] / max(distance, 1.0)) ** 2))
     return np.stack(columns, axis=1)
+
+
+def _looked_at(found: Candidates, amid: Float) -> Float:
+    """Find the point [3] m to which lines of sight come nearest, about `amid` if they are parallel."""
+    seen = (found.confidence > 0)[..., None] & np.isfinite(found.rays)
+    centre = known_median(np.where(seen, found.rays, np.nan), axis=3)
+    ray = np.einsum("tcij,tcdj->tcdi", found.rotation, np.insert(centre, 2, 1.0, axis=-1))
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    known = np.isfinite(ray[..., 0]) & np.isfinite(found.position[..., :1])
+    across = np.eye(3) - ray[known][:, :, None] * ray[known][:, None, :]
+    origin = np.broadcast_to(found.position[:, :, None], ray.shape)[known]
+    normal = across.sum(axis=0) + AMID_SHARE * max(known.sum(), 1) * np.eye(3)
+    aside = np.einsum("nij,nj->i", across, origin - amid)
+    return np.asarray(amid + np.linalg.solve(normal, aside))
 
 
 def views_with_noise(cameras: Sequence[Camera], observations: Observations) -> Views:

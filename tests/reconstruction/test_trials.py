@@ -16,7 +16,7 @@ from pipelines.reconstruction.loading import PoseDisturbance, disturbed
 from pipelines.reconstruction.observations import Camera, Candidates
 from pipelines.reconstruction.refining import with_clocks
 from pipelines.reconstruction.results import GOOD_MM, USABLE_MM, summary_of_trials, verdict
-from pipelines.reconstruction.solving import placed_by_size
+from pipelines.reconstruction.solving import placed_by_size, ray_sigma
 from pipelines.session.description import Interpolation
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections, Trajectory
@@ -91,6 +91,18 @@ def test_cameras_that_are_metres_off_start_where_people_have_their_size() -> Non
     assert np.abs(placed_by_size(joints, found, [50.0, 50.0], hips, 1.7) + off).max() < 0.1
     near = replace(found, position=found.position - 0.9 * off)
     assert not placed_by_size(joints, near, [50.0, 50.0], hips, 1.7).any()
+
+
+def test_rays_are_as_sure_as_people_are_far() -> None:
+    """Two cameras 4 m apart look at somebody 10 m away, who is not amid them."""
+    at = np.array([[-2.0, -np.sqrt(96.0), 0.0], [2.0, -np.sqrt(96.0), 0.0]])
+    rotation = matrix_from_quaternion(look_at(at, np.zeros((2, 3))))
+    seen = np.zeros((1, 2, 1, 3, 2)), np.ones((1, 2, 1, 3))
+    found = Candidates(np.zeros(1, np.int64), np.zeros((1, 2), np.int64), *seen, at[None], rotation[None])
+    stated = np.tile([1.0, 0.0], (5, 1))
+    sigma = ray_sigma([replace(camera(name), sigma=stated) for name in "ab"], found)
+    # A weight of 0.01 about the point amid them, against rays at an angle of 23 degrees, takes a fifth.
+    assert np.abs(sigma - 0.1).max() < 0.03
 
 
 @pytest.mark.parametrize(
