@@ -8,21 +8,16 @@ model, or neither it nor the logs give anything. Every method gets the same sess
 the error that all cameras of a draw share: no picture shows that error, so no method can remove it.
 
 To save time, methods share the clocks that the first of them found by keypoints, and no mistakes are searched
-for. Results are kept in build/accuracy by the hash of the code and of
-the flight's files, so an interrupted run continues, and a changed program measures anew.
+for.
 """
 
 import argparse
-import json
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import cache, partial
-from hashlib import sha256
-from itertools import chain
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
@@ -34,8 +29,8 @@ import pandas as pd
 
 from benchmarks import attitudes, bodies, detectors, gimbals, people
 from benchmarks.corpus import making
-from benchmarks.corpus.drawn import DrawnFlight, Given, Poses, kept_in_place_of_pictures
-from benchmarks.corpus.stored import CORPUS, DETECTORS, HALVES, SAMPLE, Flight, flights
+from benchmarks.corpus.drawn import FAULTS, DrawnFlight, Given, Poses, kept_in_place_of_pictures
+from benchmarks.corpus.stored import DETECTORS, HALVES, SAMPLE, Flight, flights
 from benchmarks.results import fixed, markdown_table, show
 from pipelines.detect import detect, follow
 from pipelines.geometry.arrays import Bool, Float
@@ -50,9 +45,6 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.stages import locked
 from pipelines.session.tables import ANGLES as ANGLES_TABLE
 from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
-
-ROOT = Path(__file__).parents[1]
-WORK = ROOT / "build" / "accuracy"
 
 FLOOR: Final = "floor"
 SHARED: Final = "shared"
@@ -84,6 +76,7 @@ class Case:
     detector: str
     given: Given = "model"
     draw: int = 0
+    fault: str = ""  # of FAULTS
 
 
 @dataclass(frozen=True)
@@ -107,6 +100,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flights", nargs="+", default=["all"], help="tuning, kept, all, or names")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="on all draws (default: auto robust)")
     parser.add_argument("--special", action="store_true", help="`auto` without each of its special cases")
+    parser.add_argument(
+        "--faults", nargs="*", choices=FAULTS, help="put faults into the logs (all by default)"
+    )
     parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[0])
     parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--processes", type=int, default=2)
@@ -119,6 +115,11 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
     if options.special:
         found = measured(chosen, ["auto", *SPECIAL], options.detector, options.draws, options.processes)
         yield "corpus-special", special_table(chosen, found)
+        return
+    if options.faults is not None:
+        faults = options.faults or FAULTS
+        found = measured(chosen, methods, options.detector, options.draws, options.processes, faults)
+        yield "corpus-faults", faults_table(chosen, faults, found)
         return
     found = measured(chosen, methods, options.detector, options.draws, options.processes)
     for said in GIVEN:
@@ -148,15 +149,21 @@ def chosen_flights(names: Sequence[str], detector: str) -> list[Flight]:
 
 
 def measured(
-    chosen: Sequence[Flight], methods: Sequence[str], detector: str, draws: int, processes: int
+    chosen: Sequence[Flight],
+    methods: Sequence[str],
+    detector: str,
+    draws: int,
+    processes: int,
+    faults: Sequence[str] = ("",),
 ) -> dict[Case, Outcome]:
-    """Measure every flight, draw and method; what is kept of earlier runs of the same code is taken."""
+    """Measure every flight, draw, method and fault."""
     work = [
         [
             [Case(flight.name, FLOOR, detector)],
             *([Case(flight.name, SHARED, detector, "model", draw)] for draw in range(draws)),
             *(
-                [Case(flight.name, method, detector, said, draw) for method in methods]
+                [Case(flight.name, method, detector, said, draw, fault) for method in methods]
+                for fault in faults
                 for draw in range(draws)
                 for said in GIVEN
             ),
@@ -169,7 +176,7 @@ def measured(
         tempfile.TemporaryDirectory(prefix="accuracy-") as place,
         get_context("spawn").Pool(processes) as pool,
     ):
-        done = pool.imap_unordered(partial(_outcomes_of, revision(), Path(place)), work, chunksize=1)
+        done = pool.imap_unordered(partial(_outcomes_of, Path(place)), work, chunksize=1)
         for number, outcomes in enumerate(done, 1):
             found |= outcomes
             took_s = time.perf_counter() - began_s
@@ -177,43 +184,16 @@ def measured(
     return found
 
 
-@cache
-def revision() -> str:
-    """Hash the code that decides the results."""
-    files = [*(ROOT / "pipelines").rglob("*.py"), *(ROOT / "pipelines").rglob("data/*")]
-    files += [Path(__file__), *CORPUS.glob("*.py")]
-    digest = sha256()
-    for path in sorted(filter(Path.is_file, files)):  # a folder holds compiled functions
-        digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _outcomes_of(code: str, shared: Path, groups: Sequence[Sequence[Case]]) -> dict[Case, Outcome]:
-    """Measure a flight's draws, or read their results of the same code and flight."""
+def _outcomes_of(shared: Path, groups: Sequence[Sequence[Case]]) -> dict[Case, Outcome]:
+    """Measure a flight's draws."""
     cv2.setNumThreads(1)
-    first = groups[0][0]
-    flight = next(each for each in flights() if each.name == first.flight)
-    place = WORK / f"{code}-{_files_hash(flight, first.detector)}"
-    place.mkdir(parents=True, exist_ok=True)
+    flight = next(each for each in flights() if each.name == groups[0][0].flight)
     drawn = DrawnFlight(flight, shared / flight.name)
     clocks_of_true_poses: dict[bytes, FoundClocks] = {}
-    paths = {case: place / f"{case.method}-{case.given}-{case.draw}.json" for case in chain(*groups)}
+    found: dict[Case, Outcome] = {}
     for group in groups:
-        missing = [case for case in group if not paths[case].is_file()]
-        clocks = clocks_of_true_poses if group[0].method in _POSES else {}
-        for case, outcome in measure_draw(drawn, missing, clocks) if missing else ():
-            partial_path = paths[case].with_suffix(f".{os.getpid()}")
-            partial_path.write_text(json.dumps(asdict(outcome)), encoding="utf-8")
-            partial_path.replace(paths[case])
-    return {case: Outcome(**json.loads(path.read_text(encoding="utf-8"))) for case, path in paths.items()}
-
-
-def _files_hash(flight: Flight, detector: str) -> str:
-    files = [flight.scenario_path, flight.keypoints_path(detector), *flight.background_paths]
-    digest = sha256(detector.encode())
-    for path in files:
-        digest.update(path.read_bytes() if path.is_file() else b"-")
-    return digest.hexdigest()[:16]
+        found |= measure_draw(drawn, group, clocks_of_true_poses if group[0].method in _POSES else {})
+    return found
 
 
 def measure_draw(
@@ -234,7 +214,12 @@ def measure_draw(
     with tempfile.TemporaryDirectory(prefix="accuracy-") as folder:
         place = Path(folder) / "flight"
         session = drawn.session(
-            place, first.draw, first.given, first.detector, poses=_POSES.get(first.method, "logged")
+            place,
+            first.draw,
+            first.given,
+            first.detector,
+            poses=_POSES.get(first.method, "logged"),
+            fault=first.fault,
         )
         with (
             kept_in_place_of_pictures(flight, first.detector),
@@ -361,6 +346,22 @@ def special_table(chosen: Sequence[Flight], found: Mapping[Case, Outcome]) -> li
     )
 
 
+def faults_table(chosen: Sequence[Flight], faults: Sequence[str], found: Mapping[Case, Outcome]) -> list[str]:
+    """Write for each fault mean errors of `robust` and `auto`, their largest ratio, and NEES of `auto`."""
+    rows = []
+    for fault in faults:
+        row = [fault]
+        for given in GIVEN:
+            both = [[_of(of, method, given, found, fault) for of in chosen] for method in ("robust", "auto")]
+            robust, auto = ([_mean(of, "mpjpe_mm") for of in each] for each in both)
+            levels = [_mean(of, "nees") for of in both[1]]
+            row += [f"{np.mean(robust):.0f}, {np.mean(auto):.0f}", f"{np.divide(auto, robust).max():.2f}"]
+            row.append(f"{np.mean(levels):.1f} ({max(levels):.1f})")
+        rows.append(row)
+    names = ("`robust`, `auto` mm", "largest ratio", "NEES (largest)")
+    return markdown_table(["", *(f"{name}, {said}" for said in ("stated", "not") for name in names)], rows)
+
+
 _COLUMNS = (
     ("mpjpe_mm", 0, 1),
     ("root_mpjpe_mm", 0, 1),
@@ -384,9 +385,11 @@ def angles_table(chosen: Sequence[Flight], found: Mapping[Case, Outcome]) -> lis
     return markdown_table(["half", "method", "hip flexion RMSE deg", "knee flexion", "elbow flexion"], rows)
 
 
-def _of(flight: Flight, method: str, given: Given, found: Mapping[Case, Outcome]) -> list[Outcome]:
-    wanted = (flight.name, method, "model" if method in _POSES else given)
-    return [outcome for case, outcome in found.items() if (case.flight, case.method, case.given) == wanted]
+def _of(
+    flight: Flight, method: str, given: Given, found: Mapping[Case, Outcome], fault: str = ""
+) -> list[Outcome]:
+    wanted = (flight.name, method, "model" if method in _POSES else given, fault)
+    return [of for case, of in found.items() if (case.flight, case.method, case.given, case.fault) == wanted]
 
 
 def _mean(outcomes: Sequence[Outcome], name: str) -> float:

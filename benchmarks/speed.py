@@ -1,7 +1,7 @@
 """Speed of all that takes time, beside peers: `python -m benchmarks.speed [--only NAME ...] [--write]`.
 
 Times are those of one thread with compiled code warm: the best of several runs, in processor time. Peers run
-here, but for those of `refined`, which were measured once on another machine.
+here.
 
     triangulation  22,500 frames of 17 joints in five cameras, 2 px; also 5 % gross errors and missing views
     association    five people among each other in five cameras, 450 frames
@@ -9,7 +9,6 @@ here, but for those of `refined`, which were measured once on another machine.
     logs           a recorder's log of 200 MB: rosbags iterates over raw messages, we ingest
     planner        a central plan of the seed's size and of the largest; 75 s of flight, and two arms compared
                    with 1 and 100 trials; a map of 25 M voxels
-    renderer       a picture of the sample's scene, 1280x720
     sample         the commands on the sample flight, with detection in all pictures
 """
 
@@ -25,11 +24,9 @@ from functools import partial
 from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
-import yaml  # type: ignore[import-untyped]
 from rosbags.highlevel import AnyReader
 
 from benchmarks.flights import SAMPLE, scenario_of
@@ -51,7 +48,6 @@ from pipelines.planning.scene import ReplanSettings
 from pipelines.reconstruction.refinement.refine import refine
 from pipelines.replan import replan
 from pipelines.session.records import Occupancy
-from pipelines.simulate import simulate
 from tests.geometry.rings import FOCAL, ring, with_outliers, with_pixel_noise
 from tests.keypoints.test_association import film, straight
 from tests.planning.worlds import mound, walker
@@ -131,12 +127,6 @@ def association() -> Iterator[Row]:
 
 # --- refinement ------------------------------------------------------------------------------------------
 
-_REFINED_PEERS = (
-    ("Pose2Sim, best cameras", 6.4, 12.7, 15.3),
-    ("aniposelib, optimised", 5.2, 7.4, 16.3),
-    ("aniposelib, with bone lengths", 3.4, 6.5, 14.2),
-)
-
 
 def refinement() -> Iterator[Row]:
     """Time `refined` on a walk of 75 s."""
@@ -149,8 +139,6 @@ def refinement() -> Iterator[Row]:
         errors = [mean_mm(each, flight.truth) for each in (result.position, flight.start)]
         speed = f"{2250 * 17 / took_s / 1e3:.1f} k joint-frames/s"
         yield f"refinement, {name}", speed, f"{errors[0]:.2f} mm; triangulated {errors[1]:.2f} mm"
-    for peer, speed_k, clean, bad in _REFINED_PEERS:
-        yield f"{peer} (another machine)", f"{speed_k} k joint-frames/s", f"{clean} mm; outliers {bad} mm"
 
 
 # --- logs ------------------------------------------------------------------------------------------------
@@ -231,23 +219,7 @@ def _field_of_hills() -> tuple[float, float]:
     return time.process_time() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
-# --- pictures and commands -------------------------------------------------------------------------------
-
-
-def renderer() -> Iterator[Row]:
-    """Time a second of film against the same flight without video."""
-    document: Any = yaml.safe_load((SAMPLE / "scenario.yaml").read_text(encoding="utf-8"))
-    document["duration_s"] = 1
-    with tempfile.TemporaryDirectory(prefix="speed-") as folder:
-        scenario = Path(folder) / "scenario.yaml"
-        scenario.write_text(yaml.safe_dump(document), encoding="utf-8")
-        took_s = []
-        for turn, video in enumerate((True, True, False)):  # the first compiles
-            started = time.process_time()
-            simulate(scenario, Path(folder) / str(turn), video=video)
-            took_s.append(time.process_time() - started)
-        pictures = document["drones"]["count"] * document["drones"]["camera"]["rate_hz"]
-    yield "rendered picture, 1280x720, coded", f"{1e3 * (took_s[1] - took_s[2]) / pictures:.0f} ms", ""
+# --- commands -------------------------------------------------------------------------------
 
 
 def sample() -> Iterator[Row]:
@@ -271,7 +243,6 @@ SUBJECTS: dict[str, Callable[[], Iterator[Row]]] = {
     "refinement": refinement,
     "logs": logs,
     "planner": planner,
-    "renderer": renderer,
     "sample": sample,
 }
 

@@ -38,10 +38,11 @@ from pipelines.reconstruction.background_tracks import still_name
 from pipelines.session.camera_poses import noise_models
 from pipelines.session.maps import write_grid
 from pipelines.session.parallel import contents_of
+from pipelines.session.records import Trajectory
 from pipelines.session.storage import write_json
 from pipelines.session.tables import FRAMES, KEYPOINTS, TRACKS, read_table, write_table
 from pipelines.simulate import _planner
-from pipelines.simulation.flight import SimulatedFlight, fly_scenario
+from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario
 from pipelines.simulation.flight_files import (
     TrackedKeypoints,
     logged_messages,
@@ -57,6 +58,16 @@ Poses = Literal["logged", "true", "shared"]
 Given = Literal["model", "nothing"]
 """Knowledge of the poses' errors: their model in flight.yaml, or nothing there and no covariances in logs."""
 
+FAULTS = (
+    "log 0.2 s late",
+    "pictures 0.2 s late",
+    "log frozen for 2 s",
+    "poses repeated at 5 Hz",
+    "poses at 10 Hz",
+    "compass 5 deg off",
+    "step of 1 m",
+)
+"""Faults of the last drone that nobody states."""
 _DRAWS = 100  # first of the numbers that name a draw's random numbers; the flight has those below
 _GREY = 128
 
@@ -99,6 +110,35 @@ def shared_error(flight: SimulatedFlight) -> SharedError:
     return SharedError(about, np.asarray(found[:3]), np.asarray(found[3:]))
 
 
+def with_fault(fault: str, drone: SimulatedDrone) -> SimulatedDrone:
+    """Put one of `FAULTS` into a log, or into the stamps of pictures."""
+    body, frames, late_ns = drone.log.body, drone.at_frames, 200_000_000
+    if fault == "pictures 0.2 s late":
+        return replace(drone, at_frames=replace(frames, t_ns=frames.t_ns + late_ns))
+    t_ns, rows, shift, yaw_deg = body.t_ns, np.arange(len(body.t_ns)), np.zeros(3), 0.0
+    time_s = (t_ns - t_ns[0]) / 1e9
+    after_s = time_s - time_s[-1] / 2
+    match fault:
+        case "log 0.2 s late":
+            t_ns = t_ns + late_ns
+        case "log frozen for 2 s":
+            rows[np.abs(after_s) < 1] = np.searchsorted(after_s, -1)
+        case "poses repeated at 5 Hz":
+            rows = np.searchsorted(time_s, np.floor(5 * time_s) / 5)
+        case "poses at 10 Hz":
+            rows = np.searchsorted(time_s, np.arange(0, time_s[-1], 0.1))
+            t_ns = t_ns[rows]
+        case "compass 5 deg off":
+            yaw_deg = 5.0
+        case "step of 1 m":
+            shift = np.outer(after_s > 0, [1.0, 0.0, 0.0])
+    turn = quaternion_from_rotation_vector(np.radians([0.0, 0.0, yaw_deg]))
+    covariance = None if body.covariance is None else body.covariance[rows]
+    attitude, gimbal = multiply(turn, body.quaternion_xyzw[rows]), drone.log.gimbal_xyzw[rows]
+    body = Trajectory(t_ns, body.position[rows] + shift, attitude, covariance)
+    return replace(drone, log=replace(drone.log, body=body, gimbal_xyzw=multiply(turn, gimbal)))
+
+
 @dataclass(frozen=True)
 class DrawnFlight:
     """A flight of the corpus whose logs are drawn as often as wanted.
@@ -139,7 +179,7 @@ class DrawnFlight:
         write_truth(self.folder, flight)
 
     def session(
-        self, place: Path, draw: int, given: Given, detector: str, *, poses: Poses = "logged"
+        self, place: Path, draw: int, given: Given, detector: str, *, poses: Poses = "logged", fault: str = ""
     ) -> Path:
         """Write the files of one draw into a new folder, ingest them, and return the session.
 
@@ -150,12 +190,14 @@ class DrawnFlight:
         for path in self.folder.iterdir():
             (place / path.name).symlink_to(path.resolve())
         flight = self._with_logs(draw, given)
+        if fault:
+            flight.drones[-1] = with_fault(fault, flight.drones[-1])
         for drone in flight.drones:
             with Ros2Recording(place / f"{drone.name}.mcap") as log:
                 for message in logged_messages(flight, drone):
                     log.write(message.topic, message.type, message.received_ns, message.fields)
         if not self.flight.with_pictures:
-            self._write_keypoint_files(place, detector)
+            self._write_keypoint_files(flight, place, detector)
         text = manifest_text(flight, video=self.flight.with_pictures, true_poses=poses != "logged")
         if poses == "true" and given == "model":
             exact = "\n    pose_noise: {white: {position_m: 0, rotation_deg: 0}}"
@@ -199,9 +241,9 @@ class DrawnFlight:
         scenario = scenario.model_copy(update={"drones": stating})
         return replace(first, scenario=scenario, drones=drones, people=people)
 
-    def _write_keypoint_files(self, place: Path, detector: str) -> None:
+    def _write_keypoint_files(self, flight: SimulatedFlight, place: Path, detector: str) -> None:
         """Write the detector's keypoints as AlphaPose does, with the joints of the truth (COCO's)."""
-        kept, flight = read_keypoints(self.flight.keypoints_path(detector)), self.simulated
+        kept = read_keypoints(self.flight.keypoints_path(detector))
         joints = flight.people[0].person.joints
         for drone in flight.drones:
             write_keypoints(place, flight, drone)  # for the times of the pictures
