@@ -170,7 +170,9 @@ def fit_seen_body(
     known = found.body.row
     ray = found.body.centre[:, 0] - every.camera[known]
     across = pose_sigma[known, 0] ** 2 + np.sum(ray**2, axis=1) * pose_sigma[known, 1] ** 2
-    along = _DISTANCE_SHARE**2 * ray[:, :, None] * ray[:, None]
+    # The fit takes this share of the distance from sizes, and the rest from the ground.
+    by_size = 1 / (1 + (stature_m[1] / stature_m[0] * ray[:, 2] / level_m) ** 2)
+    along = (_DISTANCE_SHARE * by_size[:, None, None]) ** 2 * ray[:, :, None] * ray[:, None]
     common = (across[:, None, None] * np.eye(3) + along)[:, None]
     body = replace(found.body, centre_covariance=found.body.centre_covariance + common.astype(np.float32))
     return SeenBody(body, found.place, found.covariance + common)
