@@ -7,8 +7,7 @@ model, or neither it nor the logs give anything. Every method gets the same sess
 `mocap reconstruct`. "True poses" is `robust` with them; "shared error" has them moved and turned together by
 the error that all cameras of a draw share: no picture shows that error, so no method can remove it.
 
-To save time, methods share the clocks that the first of them found by keypoints, and no mistakes are searched
-for.
+To save time, methods share the clocks that the first of them found by keypoints, and mistakes are not sought.
 """
 
 import argparse
@@ -118,7 +117,9 @@ def run(options: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
         return
     if options.faults is not None:
         faults = options.faults or FAULTS
-        found = measured(chosen, methods, options.detector, options.draws, options.processes, faults)
+        found = measured(
+            chosen, ("auto", "robust"), options.detector, options.draws, options.processes, faults
+        )
         yield "corpus-faults", faults_table(chosen, faults, found)
         return
     found = measured(chosen, methods, options.detector, options.draws, options.processes)

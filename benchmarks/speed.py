@@ -1,7 +1,6 @@
 """Speed of all that takes time, beside peers: `python -m benchmarks.speed [--only NAME ...] [--write]`.
 
-Times are those of one thread with compiled code warm: the best of several runs, in processor time. Peers run
-here.
+Times are processor times of one thread, the best of several runs with compiled code warm. Peers run too.
 
     triangulation  22,500 frames of 17 joints in five cameras, 2 px; also 5 % gross errors and missing views
     association    five people among each other in five cameras, 450 frames

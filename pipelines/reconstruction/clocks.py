@@ -75,8 +75,8 @@ FINE_STEP_S = 1 / 60
 # So many fine steps on each side reach over to the neighbouring coarse ones.
 FINE_STEPS = 3
 
-# Of so many suspects all sets are tried.
-MOST_IN_SETS = 3
+# Of so many suspects all sets are tried, which are fifteen at most.
+MOST_IN_SETS = 4
 
 # Of two cameras, a shift of either explains the same. Within this factor, the reference's clock is right.
 ALIKE_RATIO = 1.05
@@ -252,7 +252,7 @@ def meeting_best(views_with: Callable[[Bool], Views], suspects: Bool, t_s: Float
             continue
         old, new = (_changing_px(each, _window(t_s)) for each in missed)
         count = _independent(missed[1])
-        gain = 2 * count * np.log(old / new) / np.sqrt(2 * count)  # by what chance does
+        gain = np.sqrt(2 * count) * np.log(old / new)  # in units of what chance brings
         best, most = (changed, gain) if gain > most else (best, most)
     return best
 
