@@ -314,8 +314,8 @@ def films(options: argparse.Namespace) -> Lines:
     header = [f"{of.replace('_', ' ')}, {figure}" for figure in FIGURES for of in KINDS[::2]]
     reasons = ", ".join(f"{number} for {reason}" for reason, number in left_out.items()) or "none"
     hold = f"Of {len(rows)} intervals (95 %), {held[0]} (mm) and {held[1]} (points) hold"
-    known = calibration(np.array(rows)) if len(rows) > 2 else []
-    return [*markdown_table(["world", *header], table), "", f"{hold}; left out: {reasons}.", "", *known]
+    print("\n".join(markdown_table(["world", *header], table)))
+    return [f"{hold}; left out: {reasons}.", "", *(calibration(np.array(rows)) if len(rows) > 2 else ())]
 
 
 def differences(one: Float, other: Float) -> Float:
