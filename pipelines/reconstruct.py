@@ -441,7 +441,10 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
         aside=turned_aside,
         pose_noise=flight.settings.pose_noise,
     )
-    return [*doubts_of_clocks(flight.description, attempt.metrics.get("clocks_moved", {})), *doubts]
+    moved = attempt.metrics.get("clocks_moved", {})
+    # Of clocks that backgrounds or people showed, what is rougher says nothing new.
+    others = (doubt for doubt in doubts if doubt.code != "clock" or not {*doubt.cameras} <= {*moved})
+    return [*doubts_of_clocks(flight.description, moved), *others]
 
 
 def _unused_cameras(cameras: Sequence[Camera], result: Triangulation) -> list[str]:

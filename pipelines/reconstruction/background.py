@@ -372,12 +372,13 @@ def clock_offset(
     prior: PosePrior,
     *,
     quick: bool = False,
-) -> tuple[float, float] | None:
+) -> tuple[float, float, float] | None:
     """Find by how much (s) pictures were taken later than their stamps, and the standard deviation of that.
 
-    The log turns as the background then. `poses_at` gives the poses for `adjust` so many seconds after the
-    stamps. `quick` looks at few pictures once, and is rough for larger offsets. None: the camera turns too
-    little in the middle of the flight, the adjustment fails, or no offset is stable.
+    The log turns as the background then; the root mean square (rad) by which it errs besides is the third
+    number. `poses_at` gives the poses for `adjust` so many seconds after the stamps. `quick` looks at few
+    pictures once, and is rough for larger offsets. None: the camera turns too little in the middle of the
+    flight, the adjustment fails, or no offset is stable.
     """
     offset_s, before_s, levels = 0.0, 0.0, replace(prior, clock_s=_ANY_CLOCK_S)
     for again in range(_CLOCK_ROUNDS):
@@ -398,12 +399,13 @@ def clock_offset(
         if np.sqrt(np.var(away, axis=0).sum()) < _LEAST_TURNING:
             return None
         late_s, sigma_s = solved.clock
+        left = float(np.sqrt(np.mean(solved.errors[:, 3:] ** 2)))
         if quick:
-            return late_s, sigma_s
+            return late_s, sigma_s, left
         offset_s += late_s if late_s * before_s >= 0 else late_s / 2  # steps that swing to and fro
         before_s = late_s
         if abs(late_s) <= _SETTLED * sigma_s:
-            return (offset_s, sigma_s) if sigma_s <= _MOST_CLOCK_SIGMA_S else None
+            return (offset_s, sigma_s, left) if sigma_s <= _MOST_CLOCK_SIGMA_S else None
     return None
 
 
@@ -1154,29 +1156,36 @@ def clocks_of_backgrounds(
 ) -> tuple[Float, Float]:
     """Find the clock offset of each camera that turns: its log turns as its background does.
 
-    A rough search finds some tenths of a second, the adjustment of poses the rest. `clock_sigma_s` [C] is 0
-    for a known clock; for `stated` ones a quick look decides first. Return offsets [C] to add to the
-    pictures' times and their standard deviations, s; NaN where the clock is known or not determined.
+    The adjustment of poses finds the offset. It begins at the stamps, and with some tenths of a second that a
+    rough search finds, which slow errors of a log can mislead: that counts with which the log errs least.
+    `clock_sigma_s` [C] is 0 for a known clock; for `stated` ones a quick look decides first, and is another
+    beginning. Return offsets [C] to add to the pictures' times and their standard deviations, s; NaN where
+    the clock is known or not determined.
     """
     found = np.full((len(cameras), 2), np.nan)
     for c, (camera, stated_errors) in enumerate(zip(cameras, errors, strict=True)):
         seen = followed[camera.name]
         if clock_sigma_s[c] == 0 or isinstance(seen, str):
             continue
-        background, prior = background_of(camera, seen), PosePrior.of(stated_errors)
+        background, prior, starts_s = background_of(camera, seen), PosePrior.of(stated_errors), [0.0]
         if stated is not None and stated[c]:
             poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], 0.0, between)
             look = clock_offset(background, poses_at, prior, quick=True)
             if look is None or abs(look[0]) <= SIGMAS_TO_LOOK_CLOSER * look[1]:
                 found[c] = (np.nan, np.nan) if look is None else (0.0, look[1])
                 continue
+            starts_s.append(look[0])
         rough = common_offset([camera], {camera.name: seen}, between)
-        about_s = 0.0 if rough is None else rough.late_s
-        poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], about_s, between)
-        clock = clock_offset(background, poses_at, prior)
-        if clock is not None:
-            share = clock_sigma_s[c] ** 2 / (clock_sigma_s[c] ** 2 + clock[1] ** 2)
-            found[c] = share * (about_s + clock[0]), np.sqrt(share) * clock[1]
+        starts_s += [] if rough is None else [rough.late_s]
+        tried = []
+        for about_s in starts_s:
+            poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], about_s, between)
+            if (clock := clock_offset(background, poses_at, prior)) is not None:
+                tried.append((clock[2], about_s + clock[0], clock[1]))
+        if tried:
+            _, late_s, sigma_s = min(tried)
+            share = clock_sigma_s[c] ** 2 / (clock_sigma_s[c] ** 2 + sigma_s**2)
+            found[c] = share * late_s, np.sqrt(share) * sigma_s
     return found[:, 0], found[:, 1]
 
 
