@@ -442,8 +442,8 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
         pose_noise=flight.settings.pose_noise,
     )
     moved = attempt.metrics.get("clocks_moved", {})
-    # Of clocks that backgrounds or people showed, what is rougher says nothing new.
-    others = (doubt for doubt in doubts if doubt.code != "clock" or not {*doubt.cameras} <= {*moved})
+    # The estimate knows these clocks better than doubts do, which would contradict it.
+    others = (each for each in doubts if each.code != "clock" or {*(each.cameras or [""])} - {*moved})
     return [*doubts_of_clocks(flight.description, moved), *others]
 
 
