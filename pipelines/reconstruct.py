@@ -147,7 +147,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=57)
+RECONSTRUCT = Stage("reconstruct", revision=58)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
