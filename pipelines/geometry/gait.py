@@ -150,10 +150,11 @@ def _low_pass(values: Float, cutoff_hz: float, rate_hz: float) -> Float:
 
     Both passes have the gain 1 / (1 + (tan(w / 2) / tan(c / 2))^4). So has the least of
     |S (x - y)|^2 + |D x|^2 / tan(c / 2)^4, with sums S and differences D of second order; its ends are free.
+    Three values leave one combination open: fewer than four stay as they are.
     """
     from scipy.linalg import solveh_banded
 
-    if cutoff_hz >= 0.45 * rate_hz or len(values) < 3:
+    if cutoff_hz >= 0.45 * rate_hz or len(values) < 4:
         return values
     middle = values.mean(axis=0)  # far from the origin, rounding would count
     values = values - middle

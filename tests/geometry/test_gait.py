@@ -85,7 +85,7 @@ def test_who_is_never_seen_has_no_gait() -> None:
     assert gait_events(JOINTS, t_ns, np.full_like(position, np.nan)) is None
 
 
-@pytest.mark.parametrize("frames", [1, 2, 3])
+@pytest.mark.parametrize("frames", [1, 2, 3, 4, 5])
 def test_a_run_of_few_frames_is_filtered_far_from_the_origin(frames: int) -> None:
     values = np.full((frames, 3), 500.0)
     np.testing.assert_allclose(_low_pass(values, 0.5, 2.0), values, atol=1e-12)
