@@ -100,7 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="on all draws (default: auto robust)")
     parser.add_argument("--special", action="store_true", help="`auto` without each of its special cases")
     parser.add_argument(
-        "--faults", nargs="*", choices=FAULTS, help="put faults into the logs (all by default)"
+        "--faults", nargs="*", choices=FAULTS, help="`auto` and `robust` with faults in a log (default: each)"
     )
     parser.add_argument("--detector", choices=DETECTORS, default=DETECTORS[0])
     parser.add_argument("--draws", type=int, default=8)

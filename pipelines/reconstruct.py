@@ -443,7 +443,7 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
     )
     moved = attempt.metrics.get("clocks_moved", {})
     # The estimate knows these clocks better than doubts do, which would contradict it.
-    others = (each for each in doubts if each.code != "clock" or {*(each.cameras or [""])} - {*moved})
+    others = [of for of in doubts if of.code != "clock" or not of.cameras or {*of.cameras} - {*moved}]
     return [*doubts_of_clocks(flight.description, moved), *others]
 
 

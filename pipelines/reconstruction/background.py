@@ -399,13 +399,13 @@ def clock_offset(
         if np.sqrt(np.var(away, axis=0).sum()) < _LEAST_TURNING:
             return None
         late_s, sigma_s = solved.clock
-        left = float(np.sqrt(np.mean(solved.errors[:, 3:] ** 2)))
+        left_rad = float(np.sqrt(np.mean(solved.errors[:, 3:] ** 2)))
         if quick:
-            return late_s, sigma_s, left
+            return late_s, sigma_s, left_rad
         offset_s += late_s if late_s * before_s >= 0 else late_s / 2  # steps that swing to and fro
         before_s = late_s
         if abs(late_s) <= _SETTLED * sigma_s:
-            return (offset_s, sigma_s, left) if sigma_s <= _MOST_CLOCK_SIGMA_S else None
+            return (offset_s, sigma_s, left_rad) if sigma_s <= _MOST_CLOCK_SIGMA_S else None
     return None
 
 
@@ -1181,7 +1181,8 @@ def clocks_of_backgrounds(
         for about_s in starts_s:
             poses_at = partial(_poses_late, camera, camera.frame_t_ns[seen.rows], about_s, between)
             if (clock := clock_offset(background, poses_at, prior)) is not None:
-                tried.append((clock[2], about_s + clock[0], clock[1]))
+                late_s, sigma_s, left_rad = clock
+                tried.append((left_rad, about_s + late_s, sigma_s))
         if tried:
             _, late_s, sigma_s = min(tried)
             share = clock_sigma_s[c] ** 2 / (clock_sigma_s[c] ** 2 + sigma_s**2)

@@ -159,6 +159,19 @@ def test_each_camera_that_turns_has_its_clock_from_its_background(seconds: float
     assert squares.mean() < 9.2 / 2  # 99 % of chi-square with two degrees of freedom
 
 
+@pytest.mark.parametrize("astray_s", [-2.4, 1.6])
+def test_a_search_that_goes_astray_misleads_no_clock(
+    monkeypatch: pytest.MonkeyPatch, astray_s: float
+) -> None:
+    """Turning repeats: from another period the adjustment finds a wrong offset, or none."""
+    camera: Any = replace(late(0.06, 0.3), drift_deg=0.1)
+    astray = Lateness((0,), astray_s, 1.0, 20.0, 0.02)
+    monkeypatch.setattr("pipelines.reconstruction.background.common_offset", lambda *_: astray)
+    followed: dict[str, Any] = {camera.name: camera.followed()}
+    offset_s, _ = clocks_of_backgrounds([camera], followed, [None], np.array([0.5]), between=BETWEEN)
+    assert offset_s == pytest.approx(-0.06, abs=0.03)
+
+
 def test_no_clock_is_found_that_is_known_or_that_nothing_shows() -> None:
     team: list[Any] = [late(0.1, 0.1), late(0.1, 0.4), replace(late(0.1, 0.7), swings=False)]
     team = [replace(camera, name=f"drone{k}") for k, camera in enumerate(team)]
