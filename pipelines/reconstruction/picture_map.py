@@ -2,8 +2,9 @@
 
 Key pictures are chosen by time. Points are followed from each to the next ones through all pictures of a
 film; pictures that are too far apart in time for that are matched by SIFT features. COLMAP's global mapper
-(Pan et al. 2024) maps them. Over flat ground some of its maps contradict their own sightings; those are made
-again from the plane of the ground. The map depends on the pictures and the lens alone, so it is kept while
+(Pan et al. 2024) maps photographs, and some pictures of a film, which are mapped from the plane of the ground
+as well. COLMAP places the film's other pictures beside the better one of both, one by one (Schönberger and
+Frahm 2016). The map depends on the pictures and the lens alone, so it is kept while
 places, clocks and noise change. A similarity lays it on the logged places, roughly. One bundle adjustment
 then has the sightings, the places with errors that are correlated in time, and a level horizon as evidence.
 Its covariance is that of the attitudes.
@@ -15,8 +16,7 @@ their maps (`join_maps`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
@@ -45,12 +45,12 @@ from pipelines.reconstruction.body_fit import landmarks_of
 from pipelines.reconstruction.solving import MIN_MOMENTS, away_by_size
 
 # Another number of features, pairs or key pictures gives other maps: kept maps of an older one are not used.
-REVISION = 6
+REVISION = 7
 
 # --- which pictures, and what is matched -----------------------------------------------------------------
 
-# Sixty key pictures in twelve seconds gave 0.1 deg on the sample; with fifteen the map fell apart.
-KEY_PICTURES_OF_SHORT_FILM = 60
+# Thirty key pictures in twelve seconds give attitudes as good as sixty do (15 parts of rendered films).
+KEY_PICTURES_OF_SHORT_FILM = 30
 # Closer pictures have no parallax, and cost as much.
 MIN_KEY_STEP_S = 0.2
 # Two pictures a second keep a minute of film below 60 s of processor time, and overlap while a gimbal pans.
@@ -61,6 +61,9 @@ MOST_KEY_PICTURES = 400
 LONGER_SIDE_PX = 1280
 # Points are followed through this many pictures a second: with fewer they move too far.
 FOLLOWED_HZ = 30.0
+# Points drift while they are followed: of those seen for longer than 8 s in a minute of rendered film, 15 to
+# 50 % were 2 px off, of others 2 %. They are other points after so long.
+MAX_FOLLOWED_S = 8.0
 # Pictures further apart are photographs, whose points cannot be followed.
 MAX_FOLLOWED_STEP_S = 0.2
 # Pairs of key pictures nearer than this have so little parallax that their geometry is ambiguous: with them,
@@ -96,10 +99,11 @@ MAX_MISFIT = 9.0
 FAR_PX = 2.0
 # Of right maps at most 10 % of the sightings are far, of wrong ones 26 % and more (20 rendered cameras).
 MAX_FAR_SHARE = 0.16
-# The same share before places adjust a map, which they never do where no log has any. Of 23 right maps of
-# rendered flights 22 have 0.096 or less and one has 0.108; of seven wrong ones the least has 0.114. Begun on
-# a plane, the five that were tried have 0.03 to 0.07 and miss true places by 6 to 23 mm.
+# The same share before places adjust a map, which they never do where no log has any: 0.08 at most in 24 right
+# maps of parts of three rendered films of a minute.
 FAR_SHARE_TO_MAP_AGAIN = 0.1
+# A map of a film begins with so many key pictures about these shares of it, until one is right.
+BEGUN_WITH, BEGINS = 24, (0.5, 0.2, 0.8)
 # Pictures this many steps from the middle one say how the plane lies below it.
 PLANE_STEPS = (-12, -8, -5, -3, 3, 5, 8, 12)
 # Points on a plane that are further away, in heights of the camera above it, are seen too flatly to place.
@@ -270,11 +274,16 @@ def followed_features(
     """Return the points of the key pictures among the followed rows [P]; tracks are in shrunk pictures."""
     whole = replace(tracks, xy=(tracks.xy + 0.5) / shrinkage(intrinsics.width, intrinsics.height) - 0.5)
     rays = rays_at_stamps(whole, intrinsics, t_ns[rows])
+    first = np.full(int(tracks.point.max(initial=-1)) + 1, len(rows))
+    np.minimum.at(first, tracks.point, tracks.picture)
+    followed_s = (t_ns[rows[tracks.picture]] - t_ns[rows[first[tracks.point]]]) / 1e9
+    piece = (followed_s // MAX_FOLLOWED_S).astype(np.int64)
+    number = np.unique(tracks.point + len(first) * piece, return_inverse=True)[1]
     features = []
     for picture in np.searchsorted(rows, keys).tolist():
         mine = np.flatnonzero((tracks.picture == picture) & np.isfinite(rays).all(axis=1))
-        mine = mine[np.argsort(tracks.point[mine])]
-        features.append(KeyFeatures(rays[mine], np.empty((len(mine), 0), np.uint8), tracks.point[mine]))
+        mine = mine[np.argsort(number[mine])]
+        features.append(KeyFeatures(rays[mine], np.empty((len(mine), 0), np.uint8), number[mine]))
     return features
 
 
@@ -297,16 +306,40 @@ def map_pictures(
 ) -> PictureMap:
     """Map key pictures by their features, refining a guessed focal length; NoAttitudesError: too few.
 
-    A map of a film that its own sightings contradict is made again from a plane, and the better one counts.
-    A plane does not determine the focal length, which stays as guessed.
+    A film is mapped from a part of it on: pictures of a plane seem to move in two ways each, and one that is
+    taken wrongly breaks a map of many. Where sightings contradict the map, another part begins it.
     """
-    found = _mapped(features, intrinsics, refine_focal=refine_focal)
-    film = any(len(each.point) for each in features)
-    if film and far_share(found, intrinsics) > FAR_SHARE_TO_MAP_AGAIN:
-        with suppress(NoAttitudesError, np.linalg.LinAlgError):
-            again = _mapped_above_plane(features, intrinsics)
-            found = min(found, again, key=partial(far_share, intrinsics=intrinsics))
-    return found
+    if not any(len(each.point) for each in features):
+        return _mapped(features, intrinsics, refine_focal=refine_focal)
+    maps: list[PictureMap] = []
+    problems: list[NoAttitudesError] = []
+    for share in BEGINS:
+        first = round(np.clip(share * len(features) - BEGUN_WITH / 2, 0, max(len(features) - BEGUN_WITH, 0)))
+        try:
+            begun = _begun(features[first : first + BEGUN_WITH], intrinsics, refine_focal=refine_focal)
+            begun = replace(begun, key=begun.key + first)
+            maps.append(_continued(begun, features, intrinsics, refine_focal=refine_focal))
+        except NoAttitudesError as error:
+            problems.append(error)
+        if maps and far_share(maps[-1], intrinsics) <= FAR_SHARE_TO_MAP_AGAIN:
+            break
+    if not maps:
+        raise problems[0]
+    return min(maps, key=partial(far_share, intrinsics=intrinsics))
+
+
+def _begun(features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool) -> PictureMap:
+    """Map some key pictures of a film by COLMAP and above a plane; the one that fits its sightings counts."""
+    maps: list[PictureMap] = []
+    problems: list[NoAttitudesError] = []
+    for mapped in (partial(_mapped, refine_focal=refine_focal), _mapped_above_plane):
+        try:
+            maps.append(mapped(features, intrinsics))
+        except NoAttitudesError as error:
+            problems.append(error)
+    if not maps:
+        raise problems[0]
+    return min(maps, key=partial(far_share, intrinsics=intrinsics))
 
 
 def far_share(found: PictureMap, intrinsics: Intrinsics) -> float:
@@ -332,7 +365,6 @@ def _mapped(features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_f
     """Map by COLMAP, all pictures at once."""
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     focal_px = (intrinsics.fx * intrinsics.fy) ** 0.5
     with TemporaryDirectory() as folder:
         place = Path(folder)
@@ -349,22 +381,64 @@ def _mapped(features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_f
         adjusting.ceres.solver_options.num_threads = 1
         adjusting.refine_focal_length, adjusting.refine_extra_params = refine_focal, False
         found = pycolmap.global_mapping(place / "features.db", place, place / "maps", options=options)
-    model = max(found.values(), key=lambda each: each.num_reg_images(), default=None)
-    mapped = 0 if model is None else model.num_reg_images()
-    if model is None or mapped < max(MIN_MAPPED_PICTURES, MIN_MAPPED_SHARE * len(features)):
-        raise NoAttitudesError(
-            f"{mapped} of its {len(features)} key pictures are in one map: a camera that stands or only turns"
-            " has no parallax, and one that turns fast has pictures that share nothing"
-        )
+    model = _largest(found, len(features))
     if refine_focal and not _determines_focal(model):
         return _mapped(features, intrinsics, refine_focal=False)
     return _read_model(model, features, focal_px)
 
 
-def _read_model(model: Any, features: Sequence[KeyFeatures], focal_px: float) -> PictureMap:
-    """Read a model of COLMAP, with all sightings of its points and the pictures of a film that it lacks."""
+def _largest(found: Mapping[int, Any], count: int) -> Any:
+    """Return the largest of COLMAP's models of so many pictures; NoAttitudesError: it has too few of them."""
+    model = max(found.values(), key=lambda each: each.num_reg_images(), default=None)
+    mapped = 0 if model is None else model.num_reg_images()
+    if model is None or mapped < max(MIN_MAPPED_PICTURES, MIN_MAPPED_SHARE * count):
+        raise NoAttitudesError(
+            f"{mapped} of its {count} key pictures are in one map: a camera that stands or only turns"
+            " has no parallax, and one that turns fast has pictures that share nothing"
+        )
+    return model
+
+
+def _continued(
+    begun: PictureMap, features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool
+) -> PictureMap:
+    """Place a film's other key pictures by COLMAP, one by one, beside those of a map."""
     import pycolmap
 
+    focal_px = (intrinsics.fx * intrinsics.fy) ** 0.5
+    with TemporaryDirectory() as folder:
+        place = Path(folder)
+        _matched_pairs(place / "features.db", features, intrinsics, focal_px, verified=False)
+        with pycolmap.Database.open(place / "features.db") as database:
+            (camera,) = database.read_all_cameras()
+            images = sorted(database.read_all_images(), key=lambda image: image.name)
+        camera.params = [focal_px * begun.focal_ratio, *camera.params[1:]]
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(camera)
+        for number, at, turned in zip(
+            begun.key.tolist(), begun.position / begun.size, begun.quaternion_xyzw, strict=True
+        ):
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turned), at)
+            model.add_image_with_trivial_frame(images[number], pose.inverse())
+        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=SEED, multiple_models=False)
+        options.ba_refine_focal_length, options.ba_refine_extra_params = refine_focal, False
+        options.mapper.abs_pose_min_num_inliers = MIN_MATCHES
+        options.mapper.abs_pose_refine_focal_length = False
+        for name in ("begun", "maps"):
+            (place / name).mkdir()
+        files = place / "features.db", place, place / "begun"
+        pycolmap.triangulate_points(model, *files, options=options).write(place / "begun")
+        found = pycolmap.incremental_mapping(
+            *files[:2], place / "maps", options=options, input_path=place / "begun"
+        )
+    model = _largest(found, len(features))
+    if refine_focal and not _determines_focal(model):
+        return _continued(replace(begun, focal_ratio=1.0), features, intrinsics, refine_focal=False)
+    return _read_model(model, features, focal_px)
+
+
+def _read_model(model: Any, features: Sequence[KeyFeatures], focal_px: float) -> PictureMap:
+    """Read a model of COLMAP, with all sightings of its points in a film."""
     camera = next(iter(model.cameras.values()))
     images = {int(image.name): image for image in model.images.values() if image.has_pose}
     names = [np.full(len(each.xy), -1, np.int64) for each in features]
@@ -380,19 +454,8 @@ def _read_model(model: Any, features: Sequence[KeyFeatures], focal_px: float) ->
             if name >= 0
         }
         names = [np.array([known.get(int(point), -1) for point in each.point]) for each in features]
-    poses = {number: image.cam_from_world() for number, image in images.items()}
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.random_seed = SEED
-    for number in set(range(len(features))) - set(poses):
-        mine = np.flatnonzero(names[number] >= 0)
-        if len(mine) >= MIN_MATCHES:
-            pixels = features[number].xy[mine] * focal_px + camera.params[1:3]
-            there = np.array([model.points3D[name].xyz for name in names[number][mine]])
-            found = pycolmap.estimate_and_refine_absolute_pose(pixels, there, camera, options)
-            if found is not None:
-                poses[number] = found["cam_from_world"]
-    key = sorted(poses)
-    placed = [poses[number].inverse() for number in key]
+    key = sorted(images)
+    placed = [images[number].cam_from_world().inverse() for number in key]
     at = np.array([pose.translation for pose in placed])
     turned = np.array([pose.rotation.quat for pose in placed])
     return _with_sightings(key, at, turned, names, features, float(camera.params[0] / focal_px))
@@ -423,6 +486,7 @@ def _mapped_above_plane(features: Sequence[KeyFeatures], intrinsics: Intrinsics)
     """
     focal_px = float(intrinsics.fx * intrinsics.fy) ** 0.5 * shrinkage(intrinsics.width, intrinsics.height)
     middle, normals = len(features) // 2, []
+    near = features[max(middle - max(PLANE_STEPS), 0) : middle + max(PLANE_STEPS) + 1]
     for other in middle + np.array(PLANE_STEPS):
         if 0 <= other < len(features):
             shared = features[middle].point, features[other].point
@@ -432,11 +496,12 @@ def _mapped_above_plane(features: Sequence[KeyFeatures], intrinsics: Intrinsics)
             if moved is not None:
                 both = np.array(cv2.decomposeHomographyMat(moved, np.eye(3))[3])[..., 0]
                 normals += [normal for normal in both if np.median(rays @ normal) > 0]
-    chains = [_chain_above_plane(features, normal, focal_px) for normal in normals]
-    chains.sort(key=lambda chain: chain[2])
-    if not chains or chains[0][2] >= MAX_PLANE_ERROR_PX:
+    normals.sort(key=lambda normal: _chain_above_plane(near, normal, focal_px)[2])
+    if not normals:
         raise NoAttitudesError("its pictures show no plane")
-    at, turn, _ = chains[0]
+    at, turn, error_px = _chain_above_plane(features, normals[0], focal_px)
+    if error_px >= MAX_PLANE_ERROR_PX:
+        raise NoAttitudesError("its pictures show more than a plane")
     key = np.flatnonzero(turn.any(axis=(1, 2)))
     at, turn, names = at[key], turn[key], [each.point for each in features]
     found = _with_sightings(key.tolist(), at, quaternion_from_matrix(turn), names, features, 1.0)
@@ -450,7 +515,7 @@ def _homography(source: Float, target: Float, focal_px: float) -> Float | None:
     """Fit a homography from points [N, 2] to image points x/z, y/z [N, 2]; None: it is not determined."""
     if len(source) < MIN_MATCHES:
         return None
-    found = cv2.findHomography(source, target, cv2.RANSAC, FAR_PX / focal_px)[0]
+    found = cv2.findHomography(source, target, cv2.USAC_FAST, FAR_PX / focal_px)[0]
     return None if found is None else np.asarray(found, np.float64)
 
 
@@ -474,9 +539,11 @@ def _chain_above_plane(
         known = np.isfinite(placed[own.point, 0])
         if k != middle:
             there = placed[own.point[known]]
-            view = _homography(there, own.xy[known], focal_px)
+            # From above, y of a picture goes against y of the plane: USAC takes no mirrored points.
+            view = _homography(there * [1, -1], own.xy[known], focal_px)
             if view is None:
                 continue
+            view[:, 1] *= -1
             view *= np.sign(np.median(there @ view[2, :2] + view[2, 2]))
             view /= np.sqrt(np.linalg.norm(view[:, 0]) * np.linalg.norm(view[:, 1]))
             u, _, vt = np.linalg.svd(np.column_stack([view[:, :2], np.cross(view[:, 0], view[:, 1])]))
@@ -516,11 +583,20 @@ def _determines_focal(model: Any) -> bool:
 
 
 def _matched_pairs(
-    path: Path, features: Sequence[KeyFeatures], intrinsics: Intrinsics, focal_px: float
+    path: Path,
+    features: Sequence[KeyFeatures],
+    intrinsics: Intrinsics,
+    focal_px: float,
+    *,
+    verified: bool = True,
 ) -> int:
-    """Write features and matches as a database of pycolmap; return the number of pairs that match."""
+    """Write features and matches as a database of pycolmap; return the number of pairs that match.
+
+    Pictures of a film whose geometry is not `verified` are all paired, and what they share counts as it is.
+    """
     import pycolmap
 
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     middle = [intrinsics.width / 2, intrinsics.height / 2]
     database = pycolmap.Database.open(path)
     camera = pycolmap.Camera(
@@ -552,23 +628,30 @@ def _matched_pairs(
             database.write_descriptors(image.image_id, described)
         ids.append(image.image_id)
     for first, second in combinations(range(len(features)) if film else (), 2):
-        if second - first >= MIN_PAIR_STEPS:
+        if not verified or second - first >= MIN_PAIR_STEPS:
             points = features[first].point, features[second].point
             matches = np.stack(np.intersect1d(*points, return_indices=True)[1:], axis=1)
             if len(matches) >= MIN_MATCHES:
-                database.write_matches(ids[first], ids[second], matches.astype(np.uint32))
+                pair = ids[first], ids[second]
+                database.write_matches(*pair, matches.astype(np.uint32))
+                if not verified:
+                    shared = {
+                        "config": pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+                        "inlier_matches": matches.astype(np.uint32),
+                    }
+                    database.write_two_view_geometry(*pair, pycolmap.TwoViewGeometry(shared))
     database.close()
     verifying = pycolmap.TwoViewGeometryOptions(detect_watermark=False)
     verifying.ransac.random_seed = SEED
-    if film:
+    if film and verified:
         one = pycolmap.GeometricVerifierOptions(num_threads=1)
         pycolmap.geometric_verification(path, verifier_options=one, two_view_geometry_options=verifying)
-    else:
+    elif not film:
         matching = pycolmap.FeatureMatchingOptions(num_threads=1)
         pairing = pycolmap.SequentialPairingOptions(overlap=MATCHED_STEPS, num_threads=1)
         pycolmap.match_sequential(path, matching, pairing, verifying)
-    with pycolmap.Database.open(path) as verified:
-        return int(verified.num_verified_image_pairs())
+    with pycolmap.Database.open(path) as written:
+        return int(written.num_verified_image_pairs())
 
 
 # --- laying a map on places ------------------------------------------------------------------------------
@@ -753,10 +836,14 @@ class _Bundle:
         return (self.found.seen_xy - seen[:, :2] / seen[:, 2:]) * self.focal_px, seen
 
     def cost(self, at: Float, turn: Float, points: Float) -> float:
-        """Compute the sum of squares in standard deviations; of sightings by Cauchy's loss."""
+        """Compute the sum of squares in standard deviations; of sightings by a bounded loss.
+
+        What moves is far off wherever its point is put (Geman and McClure 1985). A loss that grows with it
+        bent the map of a level flight over flat ground by 5 deg, to please the 3 % of its points on a person.
+        """
         squares = np.square(self.residuals(at, turn, points)[0] / self.loss_px).sum(axis=1)
         apart = self.logged - self.between @ at
-        whole = np.log1p(squares).sum() * self.loss_px**2 / (SIGHTINGS_ALIKE * self.sigma_px**2)
+        whole = (squares / (1 + squares)).sum() * self.loss_px**2 / (SIGHTINGS_ALIKE * self.sigma_px**2)
         whole += np.einsum("ik,ij,jk->", apart, self.precision, apart)
         return float(whole + np.square(turn[:, 2, 0]).sum() / (np.radians(LEVEL_SIGMA_DEG) ** 2 * len(at)))
 
@@ -766,7 +853,11 @@ class _Bundle:
 
         picture, point, count = self.found.seen_in, self.found.seen_point, len(at)
         off, seen = self.residuals(at, turn, points)
-        weight = 1 / (1 + np.square(off / self.loss_px).sum(axis=1)) / (SIGHTINGS_ALIKE * self.sigma_px**2)
+        weight = (
+            1
+            / np.square(1 + np.square(off / self.loss_px).sum(axis=1))
+            / (SIGHTINGS_ALIKE * self.sigma_px**2)
+        )
         project = np.zeros((len(off), 2, 3))
         project[:, 0, 0] = project[:, 1, 1] = self.focal_px / seen[:, 2]
         project[:, :, 2] = -self.focal_px * seen[:, :2] / np.square(seen[:, 2:])
@@ -801,7 +892,12 @@ class _Bundle:
 
 
 def _adjusted(start: Similarity, bundle: _Bundle) -> _AdjustedMap:
-    """Adjust poses and points (Levenberg-Marquardt, points eliminated), with Cauchy's loss that narrows."""
+    """Adjust poses and points (Levenberg-Marquardt, points eliminated), with a bounded loss that narrows.
+
+    NoAttitudesError: the adjustment does not converge, or its equations have no unique solution.
+    """
+    from scipy.linalg import cho_factor, cho_solve
+
     found = bundle.found
     count = len(found.key)
     at = start.places(found.position)
@@ -816,7 +912,11 @@ def _adjusted(start: Similarity, bundle: _Bundle) -> _AdjustedMap:
             while damping < 1:
                 inverse = _inverse_blocks(own * (1 + damping * np.eye(3)))
                 reduced = poses + damping * np.diag(np.diag(poses)) - (mixed @ inverse @ mixed.T).toarray()
-                step = np.linalg.solve(reduced, pull - mixed @ (inverse @ push))
+                try:
+                    step = np.linalg.solve(reduced, pull - mixed @ (inverse @ push))
+                except np.linalg.LinAlgError:
+                    damping *= 10
+                    continue
                 moved = inverse @ (push - mixed.T @ step)
                 step = step.reshape(count, 6)
                 turned = matrix_from_quaternion(quaternion_from_rotation_vector(step[:, 3:])) @ turn
@@ -834,7 +934,11 @@ def _adjusted(start: Similarity, bundle: _Bundle) -> _AdjustedMap:
         else:
             raise NoAttitudesError("no attitudes fit its map and its places: the adjustment did not converge")
     poses, _, own, _, mixed = bundle.equations(at, turn, points)
-    covariance = np.linalg.inv(poses - (mixed @ _inverse_blocks(own) @ mixed.T).toarray())
+    information = poses - (mixed @ _inverse_blocks(own) @ mixed.T).toarray()
+    try:
+        covariance = cho_solve(cho_factor(information), np.eye(len(information)))
+    except np.linalg.LinAlgError:
+        raise NoAttitudesError("its sightings and its places determine no attitudes") from None
     error = np.linalg.norm(bundle.residuals(at, turn, points)[0], axis=1)
     apart = bundle.logged - bundle.between @ at
     far_share = float((error > FAR_PX).mean())

@@ -115,6 +115,14 @@ def test_followed_points_give_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     for same in (features[0], nothing):  # a camera that stands, and pictures without texture
         with pytest.raises(NoAttitudesError):
             map_pictures([same] * 12, LENS)
+    # A film is mapped from a part of it on. A point that is followed for long is another one.
+    monkeypatch.setattr("pipelines.reconstruction.picture_map.BEGUN_WITH", 10)
+    monkeypatch.setattr("pipelines.reconstruction.picture_map.MAX_FOLLOWED_S", 1.99)
+    pieces = features_of_points(places, turned, LENS, 5.0)
+    assert not set(pieces[0].point.tolist()) & set(pieces[10].point.tolist())
+    begun = map_pictures(pieces, LENS)
+    assert begun.key.tolist() == list(range(KEYS))
+    assert np.abs(errors_deg(laid_on(begun, places, CENTIMETRE), turned)).max() < 0.1
     # Over flat ground a map that contradicts its sightings begins anew on a plane.
     wrong = replace(found, position=found.position[::-1])
     monkeypatch.setattr("pipelines.reconstruction.picture_map._mapped", lambda *_, **__: wrong)
