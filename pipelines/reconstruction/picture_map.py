@@ -99,8 +99,8 @@ MAX_MISFIT = 9.0
 FAR_PX = 2.0
 # Of right maps at most 10 % of the sightings are far, of wrong ones 26 % and more (20 rendered cameras).
 MAX_FAR_SHARE = 0.16
-# The same share before places adjust a map, which they never do where no log has any: 0.08 at most in 24 right
-# maps of parts of three rendered films of a minute.
+# The same share before places adjust a map, which they never do where no log has any: 0.08 at most in 24
+# right maps of parts of three rendered films of a minute.
 FAR_SHARE_TO_MAP_AGAIN = 0.1
 # A map of a film begins with so many key pictures about these shares of it, until one is right.
 BEGUN_WITH, BEGINS = 24, (0.5, 0.2, 0.8)
