@@ -2,12 +2,12 @@
 
 Key pictures are chosen by time. Points are followed from each to the next ones through all pictures of a
 film; pictures that are too far apart in time for that are matched by SIFT features. COLMAP's global mapper
-(Pan et al. 2024) maps photographs, and some pictures of a film, which are mapped from the plane of the ground
-as well. COLMAP places the film's other pictures beside the better one of both, one by one (Schönberger and
-Frahm 2016). The map depends on the pictures and the lens alone, so it is kept while
-places, clocks and noise change. A similarity lays it on the logged places, roughly. One bundle adjustment
-then has the sightings, the places with errors that are correlated in time, and a level horizon as evidence.
-Its covariance is that of the attitudes.
+(Pan et al. 2024) maps photographs. Of a film it maps 24 pictures, which are mapped from the plane of the
+ground as well. COLMAP's incremental mapper (Schönberger and Frahm 2016) continues the better map, picture
+by picture. The map depends on the pictures and the lens alone, so it is kept while places, clocks and noise
+change. A similarity lays it on the logged places, roughly. One bundle adjustment then has the sightings,
+the places with errors that are correlated in time, and a level horizon as evidence. Its covariance is that
+of the attitudes.
 
 Each camera is mapped by itself: views of two drones that are 90 degrees apart share too little, and a joint
 map of the sample flight was wrong by 6 m. Where no log has places, people whom several cameras see join
@@ -62,7 +62,7 @@ LONGER_SIDE_PX = 1280
 # Points are followed through this many pictures a second: with fewer they move too far.
 FOLLOWED_HZ = 30.0
 # Points drift while they are followed: of those seen for longer than 8 s in a minute of rendered film, 15 to
-# 50 % were 2 px off, of others 2 %. They are other points after so long.
+# 50 % were 2 px off, of others 2 %. After that they count as new points.
 MAX_FOLLOWED_S = 8.0
 # Pictures further apart are photographs, whose points cannot be followed.
 MAX_FOLLOWED_STEP_S = 0.2
@@ -102,7 +102,7 @@ MAX_FAR_SHARE = 0.16
 # The same share before places adjust a map, which they never do where no log has any: 0.08 at most in 24
 # right maps of parts of three rendered films of a minute.
 FAR_SHARE_TO_MAP_AGAIN = 0.1
-# A map of a film begins with so many key pictures about these shares of it, until one is right.
+# A map of a film begins with so many key pictures around these places in it, until one is right.
 BEGUN_WITH, BEGINS = 24, (0.5, 0.2, 0.8)
 # Pictures this many steps from the middle one say how the plane lies below it.
 PLANE_STEPS = (-12, -8, -5, -3, 3, 5, 8, 12)
@@ -277,7 +277,9 @@ def followed_features(
     first = np.full(int(tracks.point.max(initial=-1)) + 1, len(rows))
     np.minimum.at(first, tracks.point, tracks.picture)
     followed_s = (t_ns[rows[tracks.picture]] - t_ns[rows[first[tracks.point]]]) / 1e9
-    piece = (followed_s // MAX_FOLLOWED_S).astype(np.int64)
+    # Points of one age are not cut at one time, which would part the film there: golden section spreads them.
+    spread = tracks.point * 0.618034 % 1
+    piece = (followed_s / MAX_FOLLOWED_S + spread).astype(np.int64)
     number = np.unique(tracks.point + len(first) * piece, return_inverse=True)[1]
     features = []
     for picture in np.searchsorted(rows, keys).tolist():
@@ -306,19 +308,18 @@ def map_pictures(
 ) -> PictureMap:
     """Map key pictures by their features, refining a guessed focal length; NoAttitudesError: too few.
 
-    A film is mapped from a part of it on: pictures of a plane seem to move in two ways each, and one that is
-    taken wrongly breaks a map of many. Where sightings contradict the map, another part begins it.
+    A film's map begins with a part of it. Two pictures of a plane allow two motions (Longuet-Higgins 1986),
+    and one wrong choice breaks a map of many. Where sightings contradict the map, another part begins it.
     """
     if not any(len(each.point) for each in features):
         return _mapped(features, intrinsics, refine_focal=refine_focal)
+    last = max(len(features) - BEGUN_WITH, 0)
+    begins = [round(min(max(each * len(features) - BEGUN_WITH / 2, 0), last)) for each in BEGINS]
     maps: list[PictureMap] = []
     problems: list[NoAttitudesError] = []
-    for share in BEGINS:
-        first = round(np.clip(share * len(features) - BEGUN_WITH / 2, 0, max(len(features) - BEGUN_WITH, 0)))
+    for first in dict.fromkeys(begins):
         try:
-            begun = _begun(features[first : first + BEGUN_WITH], intrinsics, refine_focal=refine_focal)
-            begun = replace(begun, key=begun.key + first)
-            maps.append(_continued(begun, features, intrinsics, refine_focal=refine_focal))
+            maps.append(_mapped_from(first, features, intrinsics, refine_focal=refine_focal))
         except NoAttitudesError as error:
             problems.append(error)
         if maps and far_share(maps[-1], intrinsics) <= FAR_SHARE_TO_MAP_AGAIN:
@@ -330,6 +331,8 @@ def map_pictures(
 
 def _begun(features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool) -> PictureMap:
     """Map some key pictures of a film by COLMAP and above a plane; the one that fits its sightings counts."""
+    if not any(len(each.point) for each in features):
+        raise NoAttitudesError(f"nothing is followed in {len(features)} of its pictures")
     maps: list[PictureMap] = []
     problems: list[NoAttitudesError] = []
     for mapped in (partial(_mapped, refine_focal=refine_focal), _mapped_above_plane):
@@ -351,7 +354,8 @@ def sighting_errors_px(found: PictureMap, intrinsics: Intrinsics) -> Float:
     """Return the distances of a map's sightings from their points [N], px of shrunk pictures."""
     turn, nowhere = matrix_from_quaternion(found.quaternion_xyzw), np.empty((0, 0))
     bundle = _Bundle(found, _shrunk_focal_px(found, intrinsics), nowhere, nowhere, nowhere)
-    at = found.position / found.size
+    # A map of unit size has points nearer than `MIN_DEPTH_M`.
+    at = 100 * found.position / found.size
     off = bundle.residuals(at, turn, _triangulated(found, at, turn))[0]
     return np.asarray(np.linalg.norm(off, axis=1))
 
@@ -371,7 +375,7 @@ def _mapped(features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_f
         matched = _matched_pairs(place / "features.db", features, intrinsics, focal_px)
         if matched < MIN_MAPPED_PICTURES:
             raise NoAttitudesError(
-                f"only {matched} pairs of its {len(features)} key pictures have {MIN_MATCHES} matches:"
+                f"only {matched} pairs of {len(features)} key pictures have {MIN_MATCHES} matches:"
                 " they are dark, blurred or without texture"
             )
         (place / "maps").mkdir()
@@ -393,18 +397,19 @@ def _largest(found: Mapping[int, Any], count: int) -> Any:
     mapped = 0 if model is None else model.num_reg_images()
     if model is None or mapped < max(MIN_MAPPED_PICTURES, MIN_MAPPED_SHARE * count):
         raise NoAttitudesError(
-            f"{mapped} of its {count} key pictures are in one map: a camera that stands or only turns"
+            f"{mapped} of {count} key pictures are in one map: a camera that stands or only turns"
             " has no parallax, and one that turns fast has pictures that share nothing"
         )
     return model
 
 
-def _continued(
-    begun: PictureMap, features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool
+def _mapped_from(
+    first: int, features: Sequence[KeyFeatures], intrinsics: Intrinsics, *, refine_focal: bool
 ) -> PictureMap:
-    """Place a film's other key pictures by COLMAP, one by one, beside those of a map."""
+    """Map some key pictures of a film from one on, and place the others beside them by COLMAP, one by one."""
     import pycolmap
 
+    begun = _begun(features[first : first + BEGUN_WITH], intrinsics, refine_focal=refine_focal)
     focal_px = (intrinsics.fx * intrinsics.fy) ** 0.5
     with TemporaryDirectory() as folder:
         place = Path(folder)
@@ -416,12 +421,13 @@ def _continued(
         model = pycolmap.Reconstruction()
         model.add_camera_with_trivial_rig(camera)
         for number, at, turned in zip(
-            begun.key.tolist(), begun.position / begun.size, begun.quaternion_xyzw, strict=True
+            (first + begun.key).tolist(), begun.position / begun.size, begun.quaternion_xyzw, strict=True
         ):
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turned), at)
             model.add_image_with_trivial_frame(images[number], pose.inverse())
         options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=SEED, multiple_models=False)
         options.ba_refine_focal_length, options.ba_refine_extra_params = refine_focal, False
+        options.extract_colors = False
         options.mapper.abs_pose_min_num_inliers = MIN_MATCHES
         options.mapper.abs_pose_refine_focal_length = False
         for name in ("begun", "maps"):
@@ -433,7 +439,7 @@ def _continued(
         )
     model = _largest(found, len(features))
     if refine_focal and not _determines_focal(model):
-        return _continued(replace(begun, focal_ratio=1.0), features, intrinsics, refine_focal=False)
+        return _mapped_from(first, features, intrinsics, refine_focal=False)
     return _read_model(model, features, focal_px)
 
 
@@ -465,7 +471,9 @@ def _with_sightings(
     key: Sequence[int], at: Float, turned: Float, names: Any, features: Sequence[KeyFeatures], ratio: float
 ) -> PictureMap:
     """Return a map of pictures with their points that are seen often; `names` has one for each, or -1."""
-    counts = np.bincount(np.concatenate([names[number][names[number] >= 0] for number in key]))
+    counts = np.bincount(np.concatenate([names[number][names[number] >= 0] for number in key]), minlength=1)
+    if counts.max() < MIN_SIGHTINGS:
+        raise NoAttitudesError("none of its points is seen often enough")
     seen = [(names[number] >= 0) & (counts[names[number]] >= MIN_SIGHTINGS) for number in key]
     points = np.concatenate([names[number][each] for number, each in zip(key, seen, strict=True)])
     return PictureMap(
@@ -486,7 +494,6 @@ def _mapped_above_plane(features: Sequence[KeyFeatures], intrinsics: Intrinsics)
     """
     focal_px = float(intrinsics.fx * intrinsics.fy) ** 0.5 * shrinkage(intrinsics.width, intrinsics.height)
     middle, normals = len(features) // 2, []
-    near = features[max(middle - max(PLANE_STEPS), 0) : middle + max(PLANE_STEPS) + 1]
     for other in middle + np.array(PLANE_STEPS):
         if 0 <= other < len(features):
             shared = features[middle].point, features[other].point
@@ -496,12 +503,10 @@ def _mapped_above_plane(features: Sequence[KeyFeatures], intrinsics: Intrinsics)
             if moved is not None:
                 both = np.array(cv2.decomposeHomographyMat(moved, np.eye(3))[3])[..., 0]
                 normals += [normal for normal in both if np.median(rays @ normal) > 0]
-    normals.sort(key=lambda normal: _chain_above_plane(near, normal, focal_px)[2])
-    if not normals:
+    chains = [_chain_above_plane(features, normal, focal_px) for normal in normals]
+    at, turn, error_px = min(chains, key=lambda chain: chain[2], default=(None, None, np.inf))
+    if at is None or turn is None or error_px >= MAX_PLANE_ERROR_PX:
         raise NoAttitudesError("its pictures show no plane")
-    at, turn, error_px = _chain_above_plane(features, normals[0], focal_px)
-    if error_px >= MAX_PLANE_ERROR_PX:
-        raise NoAttitudesError("its pictures show more than a plane")
     key = np.flatnonzero(turn.any(axis=(1, 2)))
     at, turn, names = at[key], turn[key], [each.point for each in features]
     found = _with_sightings(key.tolist(), at, quaternion_from_matrix(turn), names, features, 1.0)
@@ -516,7 +521,7 @@ def _homography(source: Float, target: Float, focal_px: float) -> Float | None:
     if len(source) < MIN_MATCHES:
         return None
     found = cv2.findHomography(source, target, cv2.USAC_FAST, FAR_PX / focal_px)[0]
-    return None if found is None else np.asarray(found, np.float64)
+    return None if found is None or not np.isfinite(found).all() else np.asarray(found, np.float64)
 
 
 def _chain_above_plane(
@@ -937,7 +942,7 @@ def _adjusted(start: Similarity, bundle: _Bundle) -> _AdjustedMap:
     information = poses - (mixed @ _inverse_blocks(own) @ mixed.T).toarray()
     try:
         covariance = cho_solve(cho_factor(information), np.eye(len(information)))
-    except np.linalg.LinAlgError:
+    except (np.linalg.LinAlgError, ValueError):
         raise NoAttitudesError("its sightings and its places determine no attitudes") from None
     error = np.linalg.norm(bundle.residuals(at, turn, points)[0], axis=1)
     apart = bundle.logged - bundle.between @ at

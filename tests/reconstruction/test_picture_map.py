@@ -87,14 +87,16 @@ def errors_deg(laid: LaidMap, turned: Float) -> Float:
     return np.degrees(rotation_vector_from_quaternion(multiply(laid.quaternion_xyzw, conjugate(turned))))
 
 
-def features_of_points(places: Float, turned: Float, lens: Intrinsics, height_m: float) -> list[KeyFeatures]:
+def features_of_points(
+    places: Float, turned: Float, lens: Intrinsics, height_m: float, seen: float = 0.7
+) -> list[KeyFeatures]:
     """Return 300 points up to a height as they are followed, off by 0.3 px; `lens` is what is known of it."""
     rng, point, xy = np.random.default_rng(7), [], []
     world = rng.uniform([-6, -6, 0], [6, 6, height_m], (300, 3))
     for pose in zip(places, turned, strict=True):
         pixels = project(transform(invert(*pose), world), LENS)
         inside = ((pixels > 0) & (pixels < [1279, 719])).all(axis=1)
-        point.append(np.flatnonzero(inside & (rng.random(300) < 0.7)))
+        point.append(np.flatnonzero(inside & (rng.random(300) < seen)))
         xy.append(pixels[point[-1]] + rng.normal(0, 0.3, (len(point[-1]), 2)))
     picture, rows = np.repeat(np.arange(KEYS), [len(each) for each in point]), np.arange(KEYS)
     tracks = Tracks(picture, np.concatenate(point), np.concatenate(xy))
@@ -115,10 +117,12 @@ def test_followed_points_give_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     for same in (features[0], nothing):  # a camera that stands, and pictures without texture
         with pytest.raises(NoAttitudesError):
             map_pictures([same] * 12, LENS)
+    with pytest.raises(NoAttitudesError):
+        map_pictures([features[0], *[replace(nothing, descriptors=np.empty((0, 0), np.uint8))] * 60], LENS)
     # A film is mapped from a part of it on. A point that is followed for long is another one.
     monkeypatch.setattr("pipelines.reconstruction.picture_map.BEGUN_WITH", 10)
     monkeypatch.setattr("pipelines.reconstruction.picture_map.MAX_FOLLOWED_S", 1.99)
-    pieces = features_of_points(places, turned, LENS, 5.0)
+    pieces = features_of_points(places, turned, LENS, 5.0, seen=1.0)
     assert not set(pieces[0].point.tolist()) & set(pieces[10].point.tolist())
     begun = map_pictures(pieces, LENS)
     assert begun.key.tolist() == list(range(KEYS))
