@@ -1067,7 +1067,11 @@ def refine_cameras(
             entries[camera.name] = {"used": False, "reason": seen}
         else:
             t_ns = camera.frame_t_ns[seen.rows]
-            found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), PosePrior.of(stated))
+            prior = PosePrior.of(stated)
+            if stated is None:
+                place, turn, arm = prior.constant
+                prior = replace(prior, constant=(float(np.hypot(place, camera.stepped_m)), turn, arm))
+            found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), prior)
             aside = _found_aside(camera, seen, between) if search and found.refused is not None else None
             if aside is not None:
                 found, angle, _ = aside

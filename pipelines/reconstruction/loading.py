@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.noise import (
     ROTATION,
+    SHIFT_IN_WORLD,
     UNKNOWN_SIGMA,
     NoiseModel,
     PoseErrors,
+    Process,
     disturb,
     errors_of_level,
     pose_errors,
@@ -108,7 +110,7 @@ def load_cameras(
     for name, source in sources.items():
         entry = description.cameras[name]
         camera = _load_camera(folder, name, description, source, joints, min_confidence, calibrated, warnings)
-        noise = stated_noise(name, entry, camera.trajectory, pose_noise)
+        noise = stated_noise(name, entry, camera.trajectory, pose_noise, camera.stepped_m)
         cameras.append(replace(camera, sigma=noise.sigma, covariance=noise.covariance))
     return cameras, warnings
 
@@ -153,6 +155,7 @@ def _load_camera(
         static=entry.poses.static,
         sigma=None,
         loosened=mended.loosened,
+        stepped_m=mended.stepped_m,
         # From here on frames count the rows of the table: pictures without a time are not in it.
         detections=replace(detections, frame=np.searchsorted(frame, detections.frame)),
     )
@@ -169,14 +172,16 @@ def load_pose_errors(
     """
     stated: list[PoseErrors | None] = []
     for camera in cameras:
-        models = stated_models(camera.name, description.cameras[camera.name], pose_noise)
+        entry = description.cameras[camera.name]
+        models = stated_models(camera.name, entry, pose_noise, camera.stepped_m)
         if camera.errors is not None:
             stated.append(camera.errors)
         elif models is not None:
             stated.append(_prior_of(models, camera))
         elif camera.covariance is not None and camera.sigma is not None:
             level = errors_of_level(np.median(camera.sigma, axis=0))
-            stated.append(replace(level, logged=True))
+            stepped = (Process(SHIFT_IN_WORLD, camera.stepped_m),) if camera.stepped_m else ()
+            stated.append(replace(level, processes=(*level.processes, *stepped), logged=True))
         else:
             stated.append(PoseErrors((0.0, 0.0), ()) if camera.static else None)
     if any(camera.errors is not None for camera in cameras):

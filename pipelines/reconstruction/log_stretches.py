@@ -1,5 +1,7 @@
 """Stretches of a log that lose their weight: it stood still and then jumped, or it jumped away and back.
 
+Positions that jump and stay there count from another place since. They are moved to that of most of the time.
+
 An estimator that hangs repeats its last pose, and a log that is stepped repeats each pose until the next. The
 poses that are repeated are wrong as soon as the camera moves on. They are bridged: interpolated between the
 last pose before and the first one after, and loosened by how far a drone may leave that line meanwhile.
@@ -30,6 +32,10 @@ STEPS_OF_JUMP = 8.0
 # A log that comes back from a jump later than this (s) has another origin since, rather than a fault.
 LONGEST_JUMP_S = 5.0
 
+# A larger step of positions is one of their origin: drones accelerate by less (m/s^2), and in normal noise no
+# step is so many times as large as nine of ten.
+MOST_ACCELERATION_MPS2, STEPS_OF_ORIGIN = 20.0, 3.0
+
 # A drone leaves a straight line by this in a second (m, rad), and by the square of the time in longer ones.
 LEFT_IN_A_SECOND = (0.25, 0.025)
 
@@ -47,6 +53,8 @@ class Mended:
     jumps: int  # stretches that begin and end with a jump
     poses: int  # that are bridged
     longest_s: float
+    steps: int = 0  # of positions that stay
+    stepped_m: float = 0.0  # standard deviation per axis of a constant error that they leave
 
 
 def mend(log: Trajectory) -> Mended:
@@ -71,9 +79,8 @@ def mend(log: Trajectory) -> Mended:
             sigma = min(LEFT_IN_A_SECOND[kind] * span_s**2, most, MOST_SIGMA[kind])
             loosened[inside, kind] = np.maximum(loosened[inside, kind], sigma)
     poses = int((loosened > 0).any(axis=1).sum())
-    if not poses:
-        return Mended(log, None, 0, 0, 0, 0.0)
-    return Mended(bridged, loosened, int(counts[0]), int(counts[1]), poses, longest_s)
+    mended = Mended(bridged, loosened, int(counts[0]), int(counts[1]), poses, longest_s)
+    return _of_one_origin(mended if poses else Mended(log, None, 0, 0, 0, 0.0))
 
 
 def _frozen(steps: Float, least: float) -> list[tuple[int, int]]:
@@ -98,6 +105,31 @@ def _jumps(t_ns: Int64, steps: Float, least: float) -> list[tuple[int, int]]:
     return found
 
 
+def _of_one_origin(mended: Mended) -> Mended:
+    """Move the parts of a log between steps that no drone can fly to the origin of most of its time."""
+    log = mended.trajectory
+    t_s, step = log.t_ns / 1e9, np.diff(log.position, axis=0)
+    if not len(step):
+        return mended
+    taken_s = np.diff(t_s)
+    speed = np.pad(step / taken_s[:, None], ((2, 2), (0, 0)), mode="edge")
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(speed, 5, axis=0), axis=-1)
+    beyond = step - taken_s[:, None] * usual
+    size = np.linalg.norm(beyond, axis=1)
+    least = np.maximum(MOST_ACCELERATION_MPS2 * taken_s**2, LEAST_JUMP[0])
+    (at,) = np.nonzero(size > np.maximum(least, STEPS_OF_ORIGIN * np.quantile(size, 0.9)))
+    if not len(at) or (len(at) - 1) * LONGEST_JUMP_S > t_s[-1] - t_s[0]:  # a log that always steps has one
+        return mended
+    origin = np.concatenate([np.zeros((1, 3)), np.cumsum(beyond[at], axis=0)])
+    bounds = np.concatenate([[0], at + 1, [len(t_s)]])
+    lasts_s = t_s[bounds[1:] - 1] - t_s[bounds[:-1]]
+    apart = np.linalg.norm(origin[:, None] - origin, axis=-1)
+    away = origin - origin[np.argmax((apart < LEAST_JUMP[0]) @ lasts_s)]
+    moved = replace(log, position=log.position - np.repeat(away, np.diff(bounds), axis=0))
+    stepped_m = np.sqrt(lasts_s @ np.sum(away**2, axis=1) / lasts_s.sum() / 3)
+    return replace(mended, trajectory=moved, steps=len(at), stepped_m=float(stepped_m))
+
+
 def _bridged(log: Trajectory, before: int, after: int, kind: int) -> Trajectory:
     """Interpolate positions (kind 0) or rotations (1) between two poses."""
     ends, inside = [before, after], slice(before + 1, after)
@@ -119,8 +151,10 @@ def _bridged(log: Trajectory, before: int, after: int, kind: int) -> Trajectory:
 
 def warnings_of_stretches(name: str, mended: Mended) -> list[str]:
     """State which poses of a camera's log lost their weight."""
+    jumps = f"{name}: its logged positions jump {mended.steps} times, as no drone does, and stay there"
+    moved = f"{jumps}: they are moved to the origin of most of the time" if mended.steps else ""
     if not mended.poses:
-        return []
+        return [moved] if moved else []
     what = [
         f"{count} {word}"
         for count, word in (
@@ -131,5 +165,6 @@ def warnings_of_stretches(name: str, mended: Mended) -> list[str]:
     ]
     return [
         f"{name}: its log has {' and '.join(what)}, for up to {mended.longest_s:.2f} s:"
-        f" {mended.poses} poses are interpolated over them and count less"
+        f" {mended.poses} poses are interpolated over them and count less",
+        *([moved] if moved else []),
     ]

@@ -71,6 +71,7 @@ class Camera:
     covariance: Float | None = None  # [N, 6, 6]
     errors: PoseErrors | None = None  # remaining errors of its poses, if they were refined beforehand
     loosened: Float | None = None  # [N, 2] m, rad: what poses in bad stretches of the log err by besides
+    stepped_m: float = 0.0  # per axis: what positions of a log that jumps and stays err by besides
     modes: ErrorModes | None = None  # of what its background leaves open, if its poses were refined by it
 
     @cached_property

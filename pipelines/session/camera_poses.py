@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Int64
-from pipelines.geometry.noise import NoiseModel, build, parse, sum_sigma
+from pipelines.geometry.noise import Bias, NoiseModel, build, parse, sum_sigma
 from pipelines.geometry.poses import interpolate_poses, rates
 from pipelines.session.description import CameraEntry, Interpolation
 from pipelines.session.errors import DataError
@@ -52,12 +52,18 @@ class StatedNoise(NamedTuple):
     covariance: Float | None  # [N, 6, 6] the log's own, where `sigma` is computed from it
 
 
-def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list[NoiseModel] | None:
-    """Return the models of a camera's pose errors; None if neither command line nor flight.yaml names any."""
+def stated_models(
+    name: str, entry: CameraEntry, pose_noise: str | None, stepped_m: float = 0.0
+) -> list[NoiseModel] | None:
+    """Return the models of a camera's pose errors; None if neither command line nor flight.yaml names any.
+
+    Positions that jumped and stayed leave a constant error `stepped_m` besides.
+    """
+    besides = [Bias(position_m=stepped_m, rotation_deg=0.0)] if stepped_m else []
     if pose_noise:
-        return parsed_noise_models(COMMAND_LINE, pose_noise)
+        return [*parsed_noise_models(COMMAND_LINE, pose_noise), *besides]
     if entry.pose_noise:
-        return noise_models(f"pose_noise of {name}", entry.pose_noise)
+        return [*noise_models(f"pose_noise of {name}", entry.pose_noise), *besides]
     return None
 
 
@@ -84,10 +90,14 @@ def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> lis
 
 
 def stated_noise(
-    name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
+    name: str,
+    entry: CameraEntry,
+    trajectory: Trajectory,
+    pose_noise: str | None = None,
+    stepped_m: float = 0.0,
 ) -> StatedNoise:
     """Compute the uncertainty of each pose by models, else its covariances; DataError: an unknown one."""
-    models = stated_models(name, entry, pose_noise)
+    models = stated_models(name, entry, pose_noise, stepped_m)
     if models is None:
         covariance = logged_covariance(trajectory)
         return StatedNoise(None if covariance is None else _level(covariance), covariance)

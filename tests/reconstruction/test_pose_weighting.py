@@ -122,6 +122,20 @@ def test_a_stepping_log_becomes_a_line_through_its_steps(every: int) -> None:
     assert off_m(found.trajectory, truth)[: -2 * every].max() < 0.1
 
 
+@pytest.mark.parametrize("other", [[], [320]], ids=["stays", "returns late"])
+def test_positions_that_jump_and_stay_are_moved_to_the_origin_of_most_time(other: list[int]) -> None:
+    truth, by = flown(), np.array([2.0, -1.0, 0.5])
+    position = truth.position.copy()
+    until = other[0] if other else len(position)
+    position[50:until] += by
+    found = mend(replace(truth, position=position))
+    assert (found.frozen, found.jumps, found.steps) == (0, 0, 1 + len(other))
+    kept = by  # seven of eight seconds, or 5.4
+    assert off_m(found.trajectory, replace(truth, position=truth.position + kept)).max() < 0.1
+    away_s = 1.0 + (SECONDS - until / RATE_HZ)
+    assert found.stepped_m == pytest.approx(np.sqrt(by @ by * away_s / SECONDS / 3), rel=0.05)
+
+
 def test_a_jump_and_back_is_bridged() -> None:
     truth = flown()
     position = truth.position.copy()
@@ -139,13 +153,14 @@ def test_a_jump_and_back_is_bridged() -> None:
         flown(speed_mps=0.0),
         flown(noise_m=0.0, speed_mps=0.0),
         held(flown(noise_m=0.01, speed_mps=0.0), RATE_HZ),
+        replace(flown(speed_mps=5.0), t_ns=10 * flown().t_ns),
         Trajectory(flown().t_ns[:1], flown().position[:1], flown().quaternion_xyzw[:1]),
     ],
-    ids=["flies", "noisy", "hovers", "stands", "hovers at 1 Hz", "one pose"],
+    ids=["flies", "noisy", "hovers", "stands", "hovers at 1 Hz", "bends at 5 Hz", "one pose"],
 )
 def test_other_logs_are_left_as_they_are(log: Trajectory) -> None:
     found = mend(log)
-    assert found.loosened is None
+    assert (found.loosened, found.stepped_m) == (None, 0.0)
     assert found.trajectory is log
 
 

@@ -195,7 +195,7 @@ def _pixels(camera: Camera, detection: Int64) -> Float:
 
 
 def _sigma(camera: Camera, entry: CameraEntry, pose_noise: str | None) -> PoseSigma:
-    models = stated_models(camera.name, entry, pose_noise)
+    models = stated_models(camera.name, entry, pose_noise, camera.stepped_m)
     if models is not None:
         length_s = float(np.ptp(camera.frame_t_ns)) / 1e9
         parts = sum((_variances(model, length_s) for model in models), np.zeros(6))
