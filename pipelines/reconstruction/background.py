@@ -1068,9 +1068,9 @@ def refine_cameras(
         else:
             t_ns = camera.frame_t_ns[seen.rows]
             prior = PosePrior.of(stated)
-            if stated is None:
-                place, turn, arm = prior.constant
-                prior = replace(prior, constant=(float(np.hypot(place, camera.stepped_m)), turn, arm))
+            if stated is None and camera.stepped_m:  # a level of its own, that other cameras do not share
+                constant = (float(np.hypot(prior.constant[0], camera.stepped_m)), *prior.constant[1:])
+                prior = replace(prior, constant=constant, assumed=False)
             found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), prior)
             aside = _found_aside(camera, seen, between) if search and found.refused is not None else None
             if aside is not None:

@@ -12,9 +12,11 @@ A camera that stands, or hovers, takes no such step, and is left as it is. Where
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_poses, multiply, rotation_vector_from_quaternion
@@ -34,7 +36,10 @@ LONGEST_JUMP_S = 5.0
 
 # A larger step of positions is one of their origin: drones accelerate by less (m/s^2), and in normal noise no
 # step is so many times as large as nine of ten.
-MOST_ACCELERATION_MPS2, STEPS_OF_ORIGIN = 20.0, 3.0
+MOST_ACCELERATION_MPS2, STEPS_OF_ORIGIN = 15.0, 3.0
+
+# Lines are laid through the positions of this time (s) before and after, and through so many at most.
+FITTED_S, MOST_FITTED = 0.2, 8
 
 # A drone leaves a straight line by this in a second (m, rad), and by the square of the time in longer ones.
 LEFT_IN_A_SECOND = (0.25, 0.025)
@@ -108,19 +113,32 @@ def _jumps(t_ns: Int64, steps: Float, least: float) -> list[tuple[int, int]]:
 def _of_one_origin(mended: Mended) -> Mended:
     """Move the parts of a log between steps that no drone can fly to the origin of most of its time."""
     log = mended.trajectory
-    t_s, step = log.t_ns / 1e9, np.diff(log.position, axis=0)
-    if not len(step):
+    t_s = (log.t_ns - log.t_ns[0]) / 1e9
+    count = int(np.clip(round(FITTED_S / np.median(np.diff(t_s))), 2, MOST_FITTED)) if len(t_s) > 1 else 2
+    if len(t_s) < 2 * count:
         return mended
-    taken_s = np.diff(t_s)
-    speed = np.pad(step / taken_s[:, None], ((2, 2), (0, 0)), mode="edge")
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(speed, 5, axis=0), axis=-1)
-    beyond = step - taken_s[:, None] * usual
+    window = partial(np.lib.stride_tricks.sliding_window_view, window_shape=count, axis=0)
+    times, places = window(t_s), window(log.position)
+    mean_s, mean = times.mean(axis=1), places.mean(axis=2)
+    apart_s = times - mean_s[:, None]
+    speed = np.einsum("nak,nk->na", places, apart_s) / np.sum(apart_s**2, axis=1)[:, None]
+    # Lines through the poses before and after the middle of each step; by how much they miss each other. An
+    # acceleration that turns round in the middle lets two pairs of poses miss by a twelfth of a t^2.
+    middle_s = (t_s[count - 1 : -count] + t_s[count : len(t_s) - count + 1]) / 2
+    before, after = slice(None, -count), slice(count, None)
+    ends = [mean[of] + (middle_s - mean_s[of])[:, None] * speed[of] for of in (before, after)]
+    beyond = ends[1] - ends[0]
     size = np.linalg.norm(beyond, axis=1)
-    least = np.maximum(MOST_ACCELERATION_MPS2 * taken_s**2, LEAST_JUMP[0])
-    (at,) = np.nonzero(size > np.maximum(least, STEPS_OF_ORIGIN * np.quantile(size, 0.9)))
+    least = np.maximum(
+        MOST_ACCELERATION_MPS2 / 12 * (times[after, -1] - times[before, 0]) ** 2, LEAST_JUMP[0]
+    )
+    least = np.maximum(least, STEPS_OF_ORIGIN * np.quantile(size, 0.9))
+    largest = maximum_filter1d(size, 2 * count + 1)
+    (at,) = np.nonzero((size > least) & (size == largest))
+    beyond, at = beyond[at], at + count - 1
     if not len(at) or (len(at) - 1) * LONGEST_JUMP_S > t_s[-1] - t_s[0]:  # a log that always steps has one
         return mended
-    origin = np.concatenate([np.zeros((1, 3)), np.cumsum(beyond[at], axis=0)])
+    origin = np.concatenate([np.zeros((1, 3)), np.cumsum(beyond, axis=0)])
     bounds = np.concatenate([[0], at + 1, [len(t_s)]])
     lasts_s = t_s[bounds[1:] - 1] - t_s[bounds[:-1]]
     apart = np.linalg.norm(origin[:, None] - origin, axis=-1)
