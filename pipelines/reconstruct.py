@@ -147,7 +147,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=58)
+RECONSTRUCT = Stage("reconstruct", revision=59)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 
@@ -444,7 +444,18 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
     moved = attempt.metrics.get("clocks_moved", {})
     # The estimate knows these clocks better than doubts do, which would contradict it.
     others = [of for of in doubts if of.code != "clock" or not of.cameras or {*of.cameras} - {*moved}]
-    return [*doubts_of_clocks(flight.description, moved), *others]
+    seen = [of for of in others if of.code == "clock" and "turning_gain" in of.evidence]
+    untrue = [of for of in seen if _are_in_time(flight, of.cameras)]
+    return [*doubts_of_clocks(flight.description, moved), *(of for of in others if of not in untrue)]
+
+
+def _are_in_time(flight: LoadedFlight, names: Sequence[str]) -> bool:
+    """Test if the adjustment of poses finds clocks right, which a wrong compass does not mislead."""
+    cameras = [camera for camera in flight.cameras if camera.name in names]
+    stated, sigma_s = np.ones(len(cameras), dtype=np.bool_), np.full(len(cameras), QUESTIONED_SIGMA_S)
+    errors, between = flight.errors(cameras), flight.between
+    late_s, _ = clocks_of_backgrounds(cameras, flight.followed, errors, sigma_s, stated, between=between)
+    return bool((late_s == 0.0).all())
 
 
 def _unused_cameras(cameras: Sequence[Camera], result: Triangulation) -> list[str]:

@@ -103,6 +103,8 @@ _WORST_PX = 2.0
 _ROUNDS, _CONVERGED = 20, (3e-4, 3e-5)  # m, rad: a tenth of what their posteriors leave
 # Poses that are farther from the log than this contradict it.
 _SIGMAS = 4.0
+# A constant rotation error that is larger is said.
+_SIGMAS_ASIDE = 5.0
 # Slow errors are linear between knots this far apart; what they do in between counts as white.
 _KNOT_S = 0.2
 # Slow errors are counted over this time in the level of all errors.
@@ -113,6 +115,10 @@ _UNKNOWN_WHITE, _UNKNOWN_RATE = (0.02, UNKNOWN_SIGMA[1]), (0.05, UNKNOWN_SIGMA[1
 _UNKNOWN_ARM_M, _USUAL_ARM_M = 0.05, 0.03  # constant shift in the camera: a lever arm that is wrong
 # Mounts and compasses of usual drones have a constant error of this angle.
 _USUAL_TURN = float(np.radians(0.15))
+# A stated level of it counts as so many numbers: errors have Student's distribution, not a normal one.
+_STATED_COUNT = 10.0
+# No compass and no mount is better than this, whatever is stated.
+_LEAST_TURN = float(np.radians(0.05))
 # A mount that nobody knows, or a wrong compass, may be off by this.
 _ANY_TURN_RAD = 0.5
 # Satellite positions that wander by 1.5 m turn the attitudes that backgrounds show by up to 3.5 deg.
@@ -123,8 +129,8 @@ _LEVEL_STEPS = 20
 _DRAWS = 512
 # Multirotors accelerate by this much per axis, so what changes faster in a log is its error.
 _ACCELERATION_MPS2 = 5.0
-# Levels have settled after so many rounds.
-_LEVEL_ROUNDS = 6
+# Levels have settled after so many rounds, or where that of a constant rotation changes by a smaller share.
+_LEVEL_ROUNDS, _LEVEL_SETTLED = 6, 0.1
 # Errors that grow and bend over a flight are told apart by so many polynomials of time.
 _POLYNOMIALS = 4
 # MacKay's rule leaps where pictures determine a smaller share of a level's errors.
@@ -177,6 +183,7 @@ class PosePrior:
     held: tuple[bool, bool] = (False, False)  # but those of slow positions, rotations were stated
     clock_s: float = 0.0  # of the offset of the pictures' clock, 0 for a known one
     assumed: bool = False  # nobody stated the constant errors either
+    usual_turn: float = _USUAL_TURN  # rad: level about which that of the constant rotation is estimated
 
     @classmethod
     def of(cls, errors: PoseErrors | None) -> PosePrior:
@@ -202,7 +209,8 @@ class PosePrior:
             held = bool(changing[SHIFT_IN_WORLD]), bool(changing[ROTATION])
             either = (slow[0] if held[0] else unknown[0], slow[1] if held[1] else unknown[1])
             return cls(_UNKNOWN_WHITE, whole, either, estimated=True, held=held)
-        return cls(errors.white, whole, slow)
+        turn = max(whole[1], _LEAST_TURN)
+        return cls(errors.white, (whole[0], turn, whole[2]), slow, usual_turn=turn)
 
     @property
     def level(self) -> Float:
@@ -329,7 +337,7 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
     pixels = float(np.median(np.concatenate([found.missed for found in results])))
     if pixels > _WORST_PX:
         return refused(f"the background moves by {pixels:.1f} px against itself", pixels)
-    surprise = max(found.surprise(prior.level) for found in results)
+    surprise = max(of.surprise((prior if prior.estimated else of.prior).level) for of in results)
     if surprise > _SIGMAS:
         return refused(f"its poses would be {surprise:.0f} standard deviations from the log", pixels)
     left = [_remaining(of.draws, float(np.median(np.diff(seen.t_s))), prior.constant[0]) for of in results]
@@ -688,15 +696,19 @@ class _Stretch:
             if found is None:
                 return None
             state = found[0]
-        for _ in range(level_rounds if prior.estimated else 0):
+        for _ in range(level_rounds):
             found = self._solve(state, prior, rounds=2)
             if found is None:
                 return None
             state, factored, _ = found
-            levels = self._estimated(state, self._draws(factored, 8), prior)
+            levels, turn = prior, prior.constant[1]
+            if prior.estimated:
+                levels = self._estimated(state, self._draws(factored, 8), prior)
             if positions_known:
                 levels = _with_position_levels(levels, prior.white[0], prior.slow[0])
             prior = with_constant_levels(levels, self._of_log(state.constant)[3:9], factored.corner[3:9, 3:9])
+            if not prior.estimated and abs(prior.constant[1] - turn) <= _LEVEL_SETTLED * turn:
+                break
         found = self._solve(state, prior, rounds=_ROUNDS)
         if found is None:
             return None
@@ -916,21 +928,25 @@ def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> P
     of which pictures say little keeps its wide level; an arm's never grows, or it would bend the path.
     """
     place, turn, arm = prior.constant
-    if 1 - np.trace(covariance[:3, :3]) / (3 * turn**2) >= _LEAST_DETERMINED:
-        turn = _constant_level(found[:3], covariance[:3, :3], turn, _USUAL_TURN)
-    if arm > 0:  # a camera that stands has none
+    determined = 1 - np.trace(covariance[:3, :3]) / (3 * turn**2)
+    if turn <= prior.usual_turn or determined >= _LEAST_DETERMINED:
+        count = USUAL_COUNT if prior.estimated else _STATED_COUNT
+        turn = _constant_level(found[:3], covariance[:3, :3], turn, prior.usual_turn, count)
+    if arm > 0 and prior.estimated:  # a camera that stands has none
         arm = min(arm, _constant_level(found[3:], covariance[3:, 3:], arm, _USUAL_ARM_M))
     return replace(prior, constant=(place, turn, arm))
 
 
-def _constant_level(found: Float, covariance: Float, level: float, usual: float) -> float:
+def _constant_level(
+    found: Float, covariance: Float, level: float, usual: float, count: float = USUAL_COUNT
+) -> float:
     precision = np.linalg.inv(covariance)
     pull, of_data = precision @ found, precision - np.eye(3) / level**2
-    variance = level**2
+    variance = max(level**2, float(np.sum((np.linalg.pinv(of_data) @ pull) ** 2)))
     for _ in range(_LEVEL_STEPS):
         posterior = np.linalg.inv(of_data + np.eye(3) / variance)
         squares = np.sum((posterior @ pull) ** 2) + np.trace(posterior)
-        variance = (USUAL_COUNT * usual**2 + squares) / (USUAL_COUNT + 3)
+        variance = (count * usual**2 + squares) / (count + 3)
     return float(np.sqrt(variance))
 
 
@@ -1073,8 +1089,9 @@ def refine_cameras(
                 prior = replace(prior, constant=constant, assumed=False)
             found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), prior)
             aside = _found_aside(camera, seen, between) if search and found.refused is not None else None
-            if aside is not None:
-                found, angle, _ = aside
+            found, angle, _ = (found, float(np.linalg.norm(found.turn)), 0.0) if aside is None else aside
+            is_odd = not prior.estimated and angle > _SIGMAS_ASIDE * prior.level[1]
+            if aside is not None or is_odd:
                 warnings.append(
                     f"{camera.name}: corrected by its background, which shows that it looks"
                     f" {np.degrees(angle):.0f} deg beside its logged attitudes"

@@ -267,14 +267,6 @@ def test_a_study_of_tilt_tells_its_ends_under_the_strongest_noise() -> None:
     assert shown[0].rows[-1][-1] == ("1600.0", "1598.0 to 1602.0")
 
 
-def test_a_study_of_two_variables_has_a_line_for_each_value_of_the_second() -> None:
-    cells = [cell(30.0 * n + t, tilt_deg=float(t), robots=n) for t in (0, 30) for n in (2, 3)]
-    table = tables(metrics_of("tilt_deg", cells))[0]
-    assert table.header == ["noise", "robots", "method", "0 deg", "30 deg"]
-    assert [row[:3] for row in table.rows] == [["none", "2", "dlt"], ["none", "3", "dlt"]]
-    assert [row[3].split()[0] for row in table.rows] == ["60.0", "90.0"]
-
-
 def test_a_study_of_a_session_shows_the_tradeoff() -> None:
     def cell(range_m: float, robots: int, error_mm: float, *, best: bool, on_it: bool) -> dict[str, Any]:
         figures = dict.fromkeys(("mpjpe_mm", "pck150", "coverage", "mean_range_m", "hidden_share"), 0.5)
