@@ -150,6 +150,8 @@ from pipelines.session.tables import (
 RECONSTRUCT = Stage("reconstruct", revision=59)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
+# A rotation of a camera that loses a larger share of the joints is one of other pictures.
+_MORE_MEASURED = 1.02
 
 
 @dataclass(frozen=True)
@@ -692,7 +694,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
 def _refined_by_backgrounds(
     flight: LoadedFlight, cameras: list[Camera], errors: Sequence[PoseErrors | None]
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    """Refine cameras by their backgrounds; a large rotation is kept if more joints can be triangulated then.
+    """Refine cameras by their backgrounds; a large rotation is left out if more joints are triangulated then.
 
     Pictures of another flight or camera show a rotation, too.
     """
@@ -704,7 +706,8 @@ def _refined_by_backgrounds(
     def measured(found: tuple[list[Camera], dict[str, Any], list[str]]) -> int:
         return int((_triangulated(flight, found[0]).result.status == STATUS.index("ok")).sum())
 
-    return max(refine(search=False), refined, key=measured)
+    held = refine(search=False)
+    return held if measured(held) > _MORE_MEASURED * measured(refined) else refined
 
 
 def _brought_together(

@@ -183,7 +183,7 @@ class PosePrior:
     held: tuple[bool, bool] = (False, False)  # but those of slow positions, rotations were stated
     clock_s: float = 0.0  # of the offset of the pictures' clock, 0 for a known one
     assumed: bool = False  # nobody stated the constant errors either
-    usual_turn: float = _USUAL_TURN  # rad: level about which that of the constant rotation is estimated
+    usual_turn: float = _USUAL_TURN  # rad: that of the constant rotation is estimated about this; 0: held
 
     @classmethod
     def of(cls, errors: PoseErrors | None) -> PosePrior:
@@ -337,7 +337,7 @@ def _adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior
     pixels = float(np.median(np.concatenate([found.missed for found in results])))
     if pixels > _WORST_PX:
         return refused(f"the background moves by {pixels:.1f} px against itself", pixels)
-    surprise = max(of.surprise((prior if prior.estimated else of.prior).level) for of in results)
+    surprise = max(of.surprise(prior.level) for of in results)
     if surprise > _SIGMAS:
         return refused(f"its poses would be {surprise:.0f} standard deviations from the log", pixels)
     left = [_remaining(of.draws, float(np.median(np.diff(seen.t_s))), prior.constant[0]) for of in results]
@@ -477,9 +477,15 @@ class _SolvedStretch:
     place_m: float = 0.0  # standard deviation of the place of a camera that stands
 
     def surprise(self, level: Float) -> float:
-        """Compute the largest rms error of the axes, in standard deviations of the log's [2]."""
+        """Compute the largest rms error of the axes, in standard deviations of the log's [2].
+
+        A constant rotation beyond what is stated is none, as far as the prior gave way to it.
+        """
         sigma = np.repeat(np.hypot(level, self.loosened), 3, axis=1)
-        return float(np.sqrt(np.mean((self.errors / sigma) ** 2, axis=0)).max())
+        errors = self.errors.copy()
+        if not self.prior.estimated and self.prior.constant[1] > self.prior.usual_turn > 0:
+            errors[:, 3:] -= errors[:, 3:].mean(axis=0)
+        return float(np.sqrt(np.mean((errors / sigma) ** 2, axis=0)).max())
 
 
 @dataclass(frozen=True)
@@ -929,7 +935,7 @@ def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> P
     """
     place, turn, arm = prior.constant
     determined = 1 - np.trace(covariance[:3, :3]) / (3 * turn**2)
-    if turn <= prior.usual_turn or determined >= _LEAST_DETERMINED:
+    if turn <= prior.usual_turn or (prior.usual_turn and determined >= _LEAST_DETERMINED):
         count = USUAL_COUNT if prior.estimated else _STATED_COUNT
         turn = _constant_level(found[:3], covariance[:3, :3], turn, prior.usual_turn, count)
     if arm > 0 and prior.estimated:  # a camera that stands has none
@@ -1071,7 +1077,8 @@ def refine_cameras(
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
     """Refine cameras by the backgrounds `followed`: cameras, remaining errors, metrics and warnings.
 
-    A background that would be refused is believed if a `search` finds that its camera looks beside the log.
+    With `search`, a background that would be refused is believed if it shows that its camera looks beside the
+    log, and one that shows a constant rotation far beyond what is stated.
     """
     refined: list[Camera] = []
     entries: dict[str, Any] = {}
@@ -1084,6 +1091,7 @@ def refine_cameras(
         else:
             t_ns = camera.frame_t_ns[seen.rows]
             prior = PosePrior.of(stated)
+            prior = prior if search or prior.estimated else replace(prior, usual_turn=0.0)
             if stated is None and camera.stepped_m:  # a level of its own, that other cameras do not share
                 constant = (float(np.hypot(prior.constant[0], camera.stepped_m)), *prior.constant[1:])
                 prior = replace(prior, constant=constant, assumed=False)
@@ -1091,7 +1099,8 @@ def refine_cameras(
             aside = _found_aside(camera, seen, between) if search and found.refused is not None else None
             found, angle, _ = (found, float(np.linalg.norm(found.turn)), 0.0) if aside is None else aside
             is_odd = not prior.estimated and angle > _SIGMAS_ASIDE * prior.level[1]
-            if aside is not None or is_odd:
+            is_aside = aside is not None or is_odd
+            if is_aside:
                 warnings.append(
                     f"{camera.name}: corrected by its background, which shows that it looks"
                     f" {np.degrees(angle):.0f} deg beside its logged attitudes"
@@ -1110,7 +1119,7 @@ def refine_cameras(
                     "log": float(np.degrees(prior.level[1])),
                     "background": float(np.degrees(np.sqrt(np.nanmedian(turn)))) if used else None,
                 },
-            } | ({} if aside is None else {"aside_deg": float(np.degrees(aside[1]))})
+            } | ({"aside_deg": float(np.degrees(angle))} if angle > _LEAST_ASIDE_RAD and is_aside else {})
             if found.frozen:
                 warnings.append(
                     f"{camera.name}: its logged position never changes, but its pictures do not show a camera"
