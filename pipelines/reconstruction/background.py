@@ -280,6 +280,7 @@ class Background:
     focal_px: float
     t_s: Float  # [T]
     loosened: Float | None = None  # [T, 2] m, rad: what logged poses in bad stretches err by besides
+    alike: float = 1.0  # pictures between two logged poses, which share the white errors of these
 
 
 def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
@@ -521,6 +522,7 @@ class _Stretch:
     knot: Int64  # [T] the knot before each picture
     share: Float  # [T] of the knot after it
     loosened: Float  # [T, 2] m, rad
+    alike: float  # pictures that share the white errors of a logged pose
     focal_px: float
     unbound: int  # pictures that share too few points with the one before
     turn: Float  # [3] constant error that was taken out of the attitudes
@@ -558,6 +560,7 @@ class _Stretch:
             knot,
             share,
             np.zeros((len(rows), 2)) if whole.loosened is None else whole.loosened[rows],
+            whole.alike,
             whole.focal_px,
             int((_shared(first, picture, len(rows)) < _FEWEST_SHARED).sum()),
             np.zeros(3),
@@ -807,7 +810,7 @@ class _Stretch:
         variance = np.square(prior.white)
         if not prior.estimated:  # an estimated level already holds what slow errors do between knots
             variance += [process.stray(float(steps.max(initial=0.0))) for process in prior.slow]
-        white = 1 / np.repeat(np.maximum(variance + self.loosened**2, EXACT**2), 3, axis=1)
+        white = 1 / np.repeat(np.maximum(self.alike * variance + self.loosened**2, EXACT**2), 3, axis=1)
         left, added = np.empty((len(steps), 6)), np.empty((len(steps), 6))
         for k, step in enumerate(steps):
             both = [process.step(float(step)) for process in prior.slow]
@@ -901,12 +904,13 @@ class _Stretch:
         """Estimate the levels of white and slow errors again by MacKay's rule."""
         design = self._design(_without(state.errors, self.position, self.rotation)[1], prior)
         usual = ~(self.loosened > 0).any(axis=1)
+        usual |= not usual.any()  # a log that repeats each pose is loosened everywhere, and little
         fresh = self._fresh(state, design)[usual]
         spread = np.stack(
             [self._fresh(_StretchState(*draw), design)[usual] for draw in zip(*draws, strict=True)]
         )
         white = [
-            _level(fresh[:, of], spread[..., of], sigma, least)
+            _level(fresh[:, of], spread[..., of], np.sqrt(self.alike) * sigma, least)
             for of, sigma, least in zip(_KINDS, prior.white, _LEAST_WHITE, strict=True)
         ]
         scale = 1 / np.sqrt(np.diff(self.knot_t_s))[:, None]
@@ -1242,7 +1246,13 @@ def background_of(camera: Camera, followed: Followed) -> Background:
         return SeenPoints(picture, point, rays)
 
     loosened = None if camera.loosened is None else camera.loosened_at(t_ns)
-    return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened)
+    logged_ns = camera.trajectory.t_ns
+    if camera.loosened is not None:
+        logged_ns = logged_ns[~camera.loosened.any(axis=1)]
+    alike = 1.0
+    if min(len(logged_ns), len(t_ns)) > 1:
+        alike = max(1.0, float(np.median(np.diff(logged_ns)) / np.median(np.diff(t_ns))))
+    return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened, alike)
 
 
 def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:

@@ -28,7 +28,6 @@ def one_joint(values: Float) -> Float:
     return values[:, None, None, :]
 
 
-# --- butterworth ---------------------------------------------------------------------------------------
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_the_gain_is_that_of_two_passes_and_nothing_lags(order: int) -> None:
     """Filter sines at 2, 6 (the cutoff: -3 dB of both passes together) and 12 Hz, one on each axis."""

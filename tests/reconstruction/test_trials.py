@@ -52,8 +52,7 @@ def test_each_camera_and_trial_has_its_own_chance_whatever_else_is_asked() -> No
     assert not np.allclose(two[0], two[1])
     assert not np.allclose(two, moved("white:position_m=0.1", trial=1))
     assert not np.allclose(two, moved("white:position_m=0.1", seed=1))
-    # Latency does not change a camera that stands still.
-    assert not moved("latency:latency_ms=50").any()
+    assert not moved("latency:latency_ms=50").any()  # of cameras that stand still
 
 
 def test_a_late_log_moves_against_its_pictures() -> None:

@@ -22,6 +22,7 @@ from pipelines.session.records import Trajectory
 LENS = Intrinsics(width=1280, height=720, fx=800.0, fy=800.0, cx=640.0, cy=360.0)
 BETWEEN = Interpolation(max_gap_s=0.2, max_extrapolation_s=0.1)
 T_NS = (np.arange(0, 6, 1 / 30) * 1e9).astype(np.int64)
+LOG = Trajectory(T_NS, np.zeros((len(T_NS), 3)), np.zeros((len(T_NS), 4)))
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Turning:
     focal_px: float = LENS.fx
     loosened: None = None
     mount_deg: float = 0.0  # of the log, about the camera's y
-    trajectory: Trajectory | None = None
+    trajectory: Trajectory = LOG
 
     def poses_at(self, t_ns: Int64, _: Interpolation) -> tuple[Float, Float]:
         """Return position [N, 3] and world_from_camera [N, 3, 3], as the log has them."""
