@@ -150,7 +150,7 @@ from pipelines.session.tables import (
 RECONSTRUCT = Stage("reconstruct", revision=59)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
-# A rotation of a camera that loses a larger share of the joints is one of other pictures.
+# Where held rotations triangulate so many times as many joints, those found are of other pictures.
 _MORE_MEASURED = 1.02
 
 
@@ -447,17 +447,20 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
     # The estimate knows these clocks better than doubts do, which would contradict it.
     others = [of for of in doubts if of.code != "clock" or not of.cameras or {*of.cameras} - {*moved}]
     seen = [of for of in others if of.code == "clock" and "turning_gain" in of.evidence]
-    untrue = [of for of in seen if _are_in_time(flight, of.cameras)]
+    untrue = [
+        of for of in seen if _are_in_time(flight, [each for each in cameras if each.name in of.cameras])
+    ]
     return [*doubts_of_clocks(flight.description, moved), *(of for of in others if of not in untrue)]
 
 
-def _are_in_time(flight: LoadedFlight, names: Sequence[str]) -> bool:
-    """Test if the adjustment of poses finds clocks right, which a wrong compass does not mislead."""
-    cameras = [camera for camera in flight.cameras if camera.name in names]
+def _are_in_time(flight: LoadedFlight, cameras: Sequence[Camera]) -> bool:
+    """Test if the adjustment of poses surely finds clocks right, which a wrong compass misleads less."""
     stated, sigma_s = np.ones(len(cameras), dtype=np.bool_), np.full(len(cameras), QUESTIONED_SIGMA_S)
     errors, between = flight.errors(cameras), flight.between
-    late_s, _ = clocks_of_backgrounds(cameras, flight.followed, errors, sigma_s, stated, between=between)
-    return bool((late_s == 0.0).all())
+    late_s, sigma_s = clocks_of_backgrounds(
+        cameras, flight.followed, errors, sigma_s, stated, between=between
+    )
+    return bool(((late_s == 0.0) & (MIN_SIGMAS_TO_MOVE * sigma_s <= OFFSET_TO_FIND_S)).all())
 
 
 def _unused_cameras(cameras: Sequence[Camera], result: Triangulation) -> list[str]:
@@ -694,7 +697,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
 def _refined_by_backgrounds(
     flight: LoadedFlight, cameras: list[Camera], errors: Sequence[PoseErrors | None]
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    """Refine cameras by their backgrounds; a large rotation is left out if more joints are triangulated then.
+    """Refine cameras by their backgrounds; all rotations are held as logged if that triangulates more joints.
 
     Pictures of another flight or camera show a rotation, too.
     """

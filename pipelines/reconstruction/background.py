@@ -103,6 +103,8 @@ _WORST_PX = 2.0
 _ROUNDS, _CONVERGED = 20, (3e-4, 3e-5)  # m, rad: a tenth of what their posteriors leave
 # Poses that are farther from the log than this contradict it.
 _SIGMAS = 4.0
+# Changing errors that are this much larger are not as stated.
+_AS_STATED = 1.3
 # A constant rotation error that is larger is said.
 _SIGMAS_ASIDE = 5.0
 # Slow errors are linear between knots this far apart; what they do in between counts as white.
@@ -183,7 +185,7 @@ class PosePrior:
     held: tuple[bool, bool] = (False, False)  # but those of slow positions, rotations were stated
     clock_s: float = 0.0  # of the offset of the pictures' clock, 0 for a known one
     assumed: bool = False  # nobody stated the constant errors either
-    usual_turn: float = _USUAL_TURN  # rad: that of the constant rotation is estimated about this; 0: held
+    usual_turn: float = _USUAL_TURN  # rad: about this the level of constant rotation is estimated; 0: held
 
     @classmethod
     def of(cls, errors: PoseErrors | None) -> PosePrior:
@@ -213,11 +215,15 @@ class PosePrior:
         return cls(errors.white, (whole[0], turn, whole[2]), slow, usual_turn=turn)
 
     @property
+    def changing(self) -> Float:
+        """Standard deviation of white and slow parts together [2] (m, rad), slow ones over some seconds."""
+        slow = [process.sigma0**2 + process.rate**2 * _SLOW_S for process in self.slow]
+        return np.maximum(np.sqrt(np.square(self.white) + slow), EXACT)
+
+    @property
     def level(self) -> Float:
         """Standard deviation of all parts together [2] (m, rad), slow ones over some seconds."""
-        slow = [process.sigma0**2 + process.rate**2 * _SLOW_S for process in self.slow]
-        constant = np.square([np.hypot(self.constant[0], self.constant[2]), self.constant[1]])
-        return np.sqrt(np.square(self.white) + constant + slow)
+        return np.hypot(self.changing, [np.hypot(self.constant[0], self.constant[2]), self.constant[1]])
 
 
 def _unknown(number: int, rate: float) -> Process:
@@ -280,7 +286,8 @@ class Background:
     focal_px: float
     t_s: Float  # [T]
     loosened: Float | None = None  # [T, 2] m, rad: what logged poses in bad stretches err by besides
-    alike: float = 1.0  # pictures between two logged poses, which share the white errors of these
+    alike: tuple[float, float] = (1.0, 1.0)
+    """Pictures between two logged positions, and rotations, which share the white errors of these."""
 
 
 def adjust(seen: Background, position: Float, rotation: Float, prior: PosePrior) -> Adjusted:
@@ -480,13 +487,19 @@ class _SolvedStretch:
     def surprise(self, level: Float) -> float:
         """Compute the largest rms error of the axes, in standard deviations of the log's [2].
 
-        A constant rotation beyond what is stated is none, as far as the prior gave way to it.
+        A constant rotation is none if the prior gave way to it, and changing errors are as stated beside it.
+        Positions that wander look like one, too, but bend.
         """
-        sigma = np.repeat(np.hypot(level, self.loosened), 3, axis=1)
-        errors = self.errors.copy()
-        if not self.prior.estimated and self.prior.constant[1] > self.prior.usual_turn > 0:
-            errors[:, 3:] -= errors[:, 3:].mean(axis=0)
-        return float(np.sqrt(np.mean((errors / sigma) ** 2, axis=0)).max())
+
+        def largest(errors: Float, of: Float) -> float:
+            sigma = np.repeat(np.hypot(of, self.loosened), 3, axis=1)
+            return float(np.sqrt(np.mean((errors / sigma) ** 2, axis=0)).max())
+
+        errors, changing = self.errors.copy(), self.errors - self.errors.mean(axis=0)
+        gave_way = not self.prior.estimated and self.prior.constant[1] > self.prior.usual_turn > 0
+        if gave_way and largest(changing, self.prior.changing) < _AS_STATED:
+            errors[:, 3:] = changing[:, 3:]
+        return largest(errors, level)
 
 
 @dataclass(frozen=True)
@@ -522,7 +535,7 @@ class _Stretch:
     knot: Int64  # [T] the knot before each picture
     share: Float  # [T] of the knot after it
     loosened: Float  # [T, 2] m, rad
-    alike: float  # pictures that share the white errors of a logged pose
+    alike: tuple[float, float]  # pictures that share the white errors of a logged position, and rotation
     focal_px: float
     unbound: int  # pictures that share too few points with the one before
     turn: Float  # [3] constant error that was taken out of the attitudes
@@ -810,7 +823,9 @@ class _Stretch:
         variance = np.square(prior.white)
         if not prior.estimated:  # an estimated level already holds what slow errors do between knots
             variance += [process.stray(float(steps.max(initial=0.0))) for process in prior.slow]
-        white = 1 / np.repeat(np.maximum(self.alike * variance + self.loosened**2, EXACT**2), 3, axis=1)
+        white = 1 / np.repeat(
+            np.maximum(np.multiply(self.alike, variance) + self.loosened**2, EXACT**2), 3, axis=1
+        )
         left, added = np.empty((len(steps), 6)), np.empty((len(steps), 6))
         for k, step in enumerate(steps):
             both = [process.step(float(step)) for process in prior.slow]
@@ -910,8 +925,8 @@ class _Stretch:
             [self._fresh(_StretchState(*draw), design)[usual] for draw in zip(*draws, strict=True)]
         )
         white = [
-            _level(fresh[:, of], spread[..., of], np.sqrt(self.alike) * sigma, least)
-            for of, sigma, least in zip(_KINDS, prior.white, _LEAST_WHITE, strict=True)
+            _level(fresh[:, of], spread[..., of], sigma, least, alike)
+            for of, sigma, least, alike in zip(_KINDS, prior.white, _LEAST_WHITE, self.alike, strict=True)
         ]
         scale = 1 / np.sqrt(np.diff(self.knot_t_s))[:, None]
         steps, spread = np.diff(state.knots, axis=0) * scale, np.diff(draws[1], axis=1) * scale
@@ -933,9 +948,10 @@ class _Stretch:
 def with_constant_levels(prior: PosePrior, found: Float, covariance: Float) -> PosePrior:
     """Estimate the levels of the constant rotation (rad) and lever arm (m) from their posterior, mean [6].
 
-    They say little, so a usual level counts as `USUAL_COUNT` more numbers (inverse gamma prior; expectation
-    maximisation). What rests on a drifting path gives way: a rotation to the log, an arm to none. A rotation
-    of which pictures say little keeps its wide level; an arm's never grows, or it would bend the path.
+    They say little, so a usual level counts as `USUAL_COUNT` more numbers, a stated one as `_STATED_COUNT`
+    (inverse gamma prior; expectation maximisation). A usual turn of 0 holds the level. What rests on a
+    drifting path gives way: a rotation to the log, an arm to none. A rotation of which pictures say little
+    keeps its wide level; an arm's never grows, or it would bend the path.
     """
     place, turn, arm = prior.constant
     determined = 1 - np.trace(covariance[:3, :3]) / (3 * turn**2)
@@ -956,7 +972,7 @@ def _constant_level(
     for _ in range(_LEVEL_STEPS):
         posterior = np.linalg.inv(of_data + np.eye(3) / variance)
         squares = np.sum((posterior @ pull) ** 2) + np.trace(posterior)
-        variance = (count * usual**2 + squares) / (count + 3)
+        variance = min((count * usual**2 + squares) / (count + 3), _ANY_TURN_RAD**2)
     return float(np.sqrt(variance))
 
 
@@ -964,15 +980,18 @@ def _parts(state: _StretchState) -> tuple[Float, Float, Float]:
     return state.errors, state.knots, state.constant
 
 
-def _level(estimates: Float, draws: Float, sigma: float, least: float) -> float:
+def _level(estimates: Float, draws: Float, sigma: float, least: float, alike: float = 1.0) -> float:
     """Estimate a standard deviation: squares of estimates over the number that the data determine.
+
+    So many are `alike`: they had that many times its square as the variance of their prior.
 
     Where the data determine little, the step is that of expectation maximisation (Dempster et al. 1977):
     it has the same fixed point, and is smaller.
     """
-    determined = 1 - np.mean(draws**2) / sigma**2
+    left = np.mean(draws**2) / alike
+    determined = 1 - left / sigma**2
     if determined < _LEAST_DETERMINED:
-        variance = np.mean(estimates**2) + np.mean(draws**2)
+        variance = np.mean(estimates**2) + left
     else:
         variance = np.mean(estimates**2) / determined
     return max(float(np.sqrt(np.clip(variance, 0.04 * sigma**2, 6.0 * sigma**2))), least)
@@ -1101,13 +1120,13 @@ def refine_cameras(
                 prior = replace(prior, constant=constant, assumed=False)
             found = adjust(background_of(camera, seen), *camera.poses_at(t_ns, between), prior)
             aside = _found_aside(camera, seen, between) if search and found.refused is not None else None
-            found, angle, _ = (found, float(np.linalg.norm(found.turn)), 0.0) if aside is None else aside
-            is_odd = not prior.estimated and angle > _SIGMAS_ASIDE * prior.level[1]
+            found, angle = (found, float(np.linalg.norm(found.turn))) if aside is None else aside[:2]
+            is_odd = search and not prior.estimated and angle > _SIGMAS_ASIDE * prior.level[1]
             is_aside = aside is not None or is_odd
             if is_aside:
                 warnings.append(
                     f"{camera.name}: corrected by its background, which shows that it looks"
-                    f" {np.degrees(angle):.0f} deg beside its logged attitudes"
+                    f" {np.degrees(angle):.1f} deg beside its logged attitudes"
                 )
             refined.append(_with_poses(camera, t_ns, found))
             used = found.refused is None
@@ -1123,7 +1142,7 @@ def refine_cameras(
                     "log": float(np.degrees(prior.level[1])),
                     "background": float(np.degrees(np.sqrt(np.nanmedian(turn)))) if used else None,
                 },
-            } | ({"aside_deg": float(np.degrees(angle))} if angle > _LEAST_ASIDE_RAD and is_aside else {})
+            } | ({"aside_deg": float(np.degrees(angle))} if is_aside else {})
             if found.frozen:
                 warnings.append(
                     f"{camera.name}: its logged position never changes, but its pictures do not show a camera"
@@ -1246,13 +1265,20 @@ def background_of(camera: Camera, followed: Followed) -> Background:
         return SeenPoints(picture, point, rays)
 
     loosened = None if camera.loosened is None else camera.loosened_at(t_ns)
+    alike = _pictures_alike(camera, t_ns, 0), _pictures_alike(camera, t_ns, 1)
+    return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened, alike)
+
+
+def _pictures_alike(camera: Camera, t_ns: Int64, kind: int) -> float:
+    """Count the pictures between two logged positions (0) or rotations (1) that are no bridge; 1 or more."""
     logged_ns = camera.trajectory.t_ns
     if camera.loosened is not None:
-        logged_ns = logged_ns[~camera.loosened.any(axis=1)]
-    alike = 1.0
-    if min(len(logged_ns), len(t_ns)) > 1:
-        alike = max(1.0, float(np.median(np.diff(logged_ns)) / np.median(np.diff(t_ns))))
-    return Background(between, camera.focal_px, (t_ns - t_ns[0]) / 1e9, loosened, alike)
+        logged_ns = logged_ns[camera.loosened[:, kind] == 0]
+    if min(len(logged_ns), len(t_ns)) < 2:
+        return 1.0
+    after = np.clip(np.searchsorted(logged_ns, t_ns, side="right"), 1, len(logged_ns) - 1)
+    gap_ns = float(np.median(logged_ns[after] - logged_ns[after - 1]))
+    return max(1.0, gap_ns / max(float(np.median(np.diff(t_ns))), 1.0))
 
 
 def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted) -> Camera:

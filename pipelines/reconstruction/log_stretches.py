@@ -38,6 +38,9 @@ LONGEST_JUMP_S = 5.0
 # step is so many times as large as nine of ten.
 MOST_ACCELERATION_MPS2, STEPS_OF_ORIGIN = 15.0, 3.0
 
+# The share of a step, backwards, from which it is one of two.
+BACK = 0.75
+
 # Lines are laid through the positions of this time (s) before and after, and through so many at most.
 FITTED_S, MOST_FITTED = 0.2, 8
 
@@ -135,6 +138,10 @@ def _of_one_origin(mended: Mended) -> Mended:
     least = np.maximum(least, STEPS_OF_ORIGIN * np.quantile(size, 0.9))
     largest = maximum_filter1d(size, 2 * count + 1)
     (at,) = np.nonzero((size > least) & (size == largest))
+    # Poses that are wrong for a moment step away and back by more than lines lean beside a step that stays.
+    near = [beyond[max(k - 2 * count, 0) : k + 2 * count + 1] @ beyond[k] for k in at.tolist()]
+    stay = [bool(each.min() > -BACK * size[k] ** 2) for k, each in zip(at.tolist(), near, strict=True)]
+    at = at[np.array(stay, dtype=np.bool_)]
     beyond, at = beyond[at], at + count - 1
     if not len(at) or (len(at) - 1) * LONGEST_JUMP_S > t_s[-1] - t_s[0]:  # a log that always steps has one
         return mended

@@ -104,7 +104,7 @@ def adjusted(
 ) -> Adjusted:
     """Adjust poses of pictures 30 times a second."""
     seen, t_s = SeenPoints(picture, point, xy), np.arange(len(poses[0])) / 30
-    return adjust(Background(seen.between, FOCAL, t_s, None, alike), *poses, prior)
+    return adjust(Background(seen.between, FOCAL, t_s, None, (alike, alike)), *poses, prior)
 
 
 def refined(way_m: float, seed: int, lost: float = 0.0) -> tuple[Adjusted, Float, Float, Float, Float]:
