@@ -64,7 +64,7 @@ SECTIONS = (
             Part("corpus-nothing", "The corpus, pose noise not stated", RENDERED, KEPT),
             Part("angles", "Joint angles", RENDERED, KEPT),
             Part("corpus-special", "`auto` without each of its special cases", RENDERED, "17-stand tuned on"),
-            Part("corpus-faults", "Faults of one drone that nobody states", RENDERED, "06-turn tuned on"),
+            Part("corpus-faults", "Faults of one drone that nobody states", RENDERED, "tuned on"),
             Part("bodies", "Bodies with a surface, noise stated", RENDERED, KEPT),
         ),
     ),
