@@ -454,7 +454,7 @@ def _doubts(flight: LoadedFlight, attempt: Attempt) -> list[Doubt]:
 
 
 def _are_in_time(flight: LoadedFlight, cameras: Sequence[Camera]) -> bool:
-    """Test if the adjustment of poses surely finds clocks right, which a wrong compass misleads less."""
+    """Test if the adjustment of poses surely finds clocks right; a wrong compass hardly misleads it."""
     stated, sigma_s = np.ones(len(cameras), dtype=np.bool_), np.full(len(cameras), QUESTIONED_SIGMA_S)
     errors, between = flight.errors(cameras), flight.between
     late_s, sigma_s = clocks_of_backgrounds(

@@ -38,7 +38,7 @@ LONGEST_JUMP_S = 5.0
 # step is so many times as large as nine of ten.
 MOST_ACCELERATION_MPS2, STEPS_OF_ORIGIN = 15.0, 3.0
 
-# The share of a step, backwards, from which it is one of two.
+# A step beside which another one leads back by this share of it is one of a pair.
 BACK = 0.75
 
 # Lines are laid through the positions of this time (s) before and after, and through so many at most.
@@ -176,8 +176,8 @@ def _bridged(log: Trajectory, before: int, after: int, kind: int) -> Trajectory:
 
 def warnings_of_stretches(name: str, mended: Mended) -> list[str]:
     """State which poses of a camera's log lost their weight."""
-    jumps = f"{name}: its logged positions jump {mended.steps} times, as no drone does, and stay there"
-    moved = f"{jumps}: they are moved to the origin of most of the time" if mended.steps else ""
+    jumps = f"{name}: its logged positions jump as no drone flies, and stay there (jumps: {mended.steps})"
+    moved = f"{jumps}; they are moved to the origin of most of the time" if mended.steps else ""
     if not mended.poses:
         return [moved] if moved else []
     what = [
