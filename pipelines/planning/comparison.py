@@ -15,8 +15,15 @@ from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.metrics import LEVEL, STRETCH_S, intervals
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.formation import TILT, slot_of
-from pipelines.planning.imperfections import blown
-from pipelines.planning.replay import LOGGED, ArmFlight, MeasuredJoints, aimed_at, looks_rad, seen_people
+from pipelines.planning.replay import (
+    LOGGED,
+    ArmFlight,
+    MeasuredJoints,
+    aimed_at,
+    blown,
+    looks_rad,
+    seen_people,
+)
 from pipelines.planning.scene import ReplayScene
 from pipelines.planning.scores import blind_s, score, view_quality
 from pipelines.planning.scores import coverage as viewed

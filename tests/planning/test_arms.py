@@ -17,7 +17,6 @@ from pipelines.planning.config import SETTINGS, Imperfections, PlannerConfig, pl
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.forecast import ActorFilter, Forecast
 from pipelines.planning.formation import FormationPath, costs_of_slots, formation_slots, slot_of, slot_offsets
-from pipelines.planning.imperfections import aimed
 from pipelines.planning.local import (
     ACCELERATION,
     INTEGRAL,
@@ -27,7 +26,7 @@ from pipelines.planning.local import (
     roll_out,
     stopping_ticks,
 )
-from pipelines.planning.replay import Replay, Start, replay
+from pipelines.planning.replay import Replay, Start, aimed, replay
 from pipelines.planning.scores import blind_s, hidden_by_people, propulsion_w, score, sights, used_kj
 from pipelines.session.errors import DataError
 from tests.planning.worlds import bare_ground, mound, trees, walker, wall
