@@ -389,7 +389,9 @@ class Objective:
         described, known = self.trial.described, []
         for each in tried:
             wider = each.scene or described
-            constant = 12 * float(np.log(wider.sigma[:, 0] / described.sigma[:, 0]).sum())
+            uncertain = described.sigma[:, 0] > 0  # exact poses have no larger errors
+            of_cameras = wider.sigma[uncertain, 0] / described.sigma[uncertain, 0]
+            constant = 12 * float(np.log(of_cameras).sum())
             changing = np.log(picture_variance(wider) / picture_variance(described))
             cost = self._fit(wider).cost + constant + 2 * float(self._pictures @ changing)
             known.append(self.scored(each, cost))
