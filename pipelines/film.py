@@ -25,6 +25,7 @@ from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.cameras import project
 from pipelines.geometry.noise import NoiseModel, pose_errors
 from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.geometry.triangulation import triangulate
 from pipelines.keypoints.corrections import (
     Calibration,
     measured_for,
@@ -50,9 +51,10 @@ from pipelines.reconstruction.background_tracks import (
     people_boxes,
 )
 from pipelines.reconstruction.ground import bind_positions
-from pipelines.reconstruction.observations import Camera, Observations, observe, on_sides
+from pipelines.reconstruction.observations import Camera, Observations, observe
 from pipelines.reconstruction.refining import refined_points
 from pipelines.reconstruction.solving import views_as_stated
+from pipelines.reconstruction.view_errors import without_view_errors
 from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -76,7 +78,7 @@ from pipelines.simulation.walks import (
     views_of,
 )
 
-FILM = Stage("film", revision=18)
+FILM = Stage("film", revision=19)
 
 # The session's truth is interpolated, which moves the hips of a runner by less than this.
 MAX_HIPS_OFF_M = 0.05
@@ -198,7 +200,11 @@ def film(
             seed = compared.settings["seed"]  # one draw of the comparison's pose noise
             found = _detections(arm, parts, calibration)
             cameras = [
-                _corrected(arm, sightings, found, parts, seed=seed, draw=draw) for draw in range(DRAWS)
+                [
+                    replace(camera, blazepose=confidences is not None)
+                    for camera in _corrected(arm, sightings, found, parts, seed=seed, draw=draw)
+                ]
+                for draw in range(DRAWS)
             ]
             observed = [_observed(arm, own) for own in cameras]
             measured = [_measured(arm, p, seen, cameras, observed) for p, seen in enumerate(sightings)]
@@ -501,10 +507,11 @@ def _observed(arm: _Arm, cameras: list[Camera]) -> Observations:
         for c, seen in enumerate(camera.detections for camera in cameras):
             rank = np.arange(len(seen.frame)) - np.searchsorted(seen.frame, seen.frame)
             choice[seen.frame, c, seen.person] = rank
-    observed = observe(cameras, found, choice, arm.t_ns, between)
-    sides, _ = agreeing_sides(observed, sigma)
-    rays, confidence = on_sides(observed.rays, observed.confidence, sides)
-    return replace(observed, rays=rays, confidence=confidence)
+    sides, _ = agreeing_sides(observe(cameras, found, choice, arm.t_ns, between), sigma)
+    observed = observe(cameras, found, choice, arm.t_ns, between, sides)
+    points = triangulate(views_as_stated(cameras, observed), method="robust")
+    cameras = without_view_errors(cameras, found, choice, observed, sides, points, None)
+    return observe(cameras, found, choice, arm.t_ns, between, sides)
 
 
 def _measured(

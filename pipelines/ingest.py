@@ -98,7 +98,7 @@ from pipelines.sources.pictures import open_files
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=21)
+INGEST = Stage("ingest", revision=22)
 
 OF_ONE_CAMERA = (
     "one camera gives a rough estimate: how far away people are is told by their stature alone; a second"

@@ -121,6 +121,7 @@ from pipelines.reconstruction.solving import (
     solver_for,
     views_with_noise,
 )
+from pipelines.reconstruction.view_errors import without_view_errors
 from pipelines.session.description import (
     Description,
     Doubt,
@@ -147,7 +148,7 @@ from pipelines.session.tables import (
     write_table,
 )
 
-RECONSTRUCT = Stage("reconstruct", revision=59)
+RECONSTRUCT = Stage("reconstruct", revision=60)
 # A longer gap is no measurement.
 _LONGEST_FILL_S = 10.0
 # Where held rotations triangulate so many times as many joints, those found are of other pictures.
@@ -614,6 +615,7 @@ def reconstruct_once(flight: LoadedFlight, cameras: list[Camera], progress: Prog
         cameras, background["ground"] = binding.cameras, binding.entry
     if made is None or cameras is not logged:
         made = _triangulated(flight, cameras)
+    cameras, made = _without_view_errors(flight, cameras, made)
     flight.waiting.release()
     seen, views, solve = made.seen, made.views, made.solve
     observations = seen.observations
@@ -819,6 +821,10 @@ class _Triangulated:
 def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
     seen = flight.waiting.put(_observe(flight, cameras))
     flight.waiting.release()
+    return _solved(flight, cameras, seen)
+
+
+def _solved(flight: LoadedFlight, cameras: list[Camera], seen: _Seen) -> _Triangulated:
     views = views_with_noise(cameras, seen.observations)
     solve = solver_for(flight.settings.method, cameras, seen.observations)
     if len(cameras) == 1:
@@ -834,6 +840,22 @@ def _triangulated(flight: LoadedFlight, cameras: list[Camera]) -> _Triangulated:
             seen, views, flight.waiting.put(one.result), solve, one.bodies, one.with_second_drone_mm
         )
     return _Triangulated(seen, views, flight.waiting.put(solve(views)), solve)
+
+
+def _without_view_errors(
+    flight: LoadedFlight, cameras: list[Camera], made: _Triangulated
+) -> tuple[list[Camera], _Triangulated]:
+    """Remove the errors of the detector that depend on the side that it sees; triangulate again."""
+    if not any(camera.blazepose for camera in cameras):
+        return cameras, made
+    seen = made.seen
+    choice, seen_by = seen.association.choice, (seen.observations, seen.sides)
+    cameras = without_view_errors(
+        cameras, seen.found, choice, *seen_by, made.result, flight.description.stature_m
+    )
+    observations = observe(cameras, seen.found, choice, seen.observations.t_ns, flight.between, seen.sides)
+    seen = flight.waiting.put(replace(seen, observations=observations))
+    return cameras, _solved(flight, cameras, seen)
 
 
 def _doubted(made: _Triangulated) -> list[str]:

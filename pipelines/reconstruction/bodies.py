@@ -12,16 +12,14 @@ from pipelines.geometry.arrays import Bool, Float, Index, Int64
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE, body_model
 from pipelines.geometry.noise import UNKNOWN_SIGMA
 from pipelines.geometry.poses import interpolate_poses
-from pipelines.geometry.rig import BONES, CENTRES, unit
+from pipelines.geometry.rig import BONES, CENTRES
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.body_fit import (
-    TRUNK,
     BodyFit,
     Landmarks,
     Rays,
     fit_body,
     landmarks_of,
-    side_view_errors,
 )
 from pipelines.reconstruction.observations import Observations
 from pipelines.reconstruction.one_camera import (
@@ -96,11 +94,8 @@ def _errors(
     distance = np.linalg.norm(away, axis=-1, keepdims=True)
     ray = away / distance
     across = np.nan_to_num(np.eye(3) - ray[..., None] * ray[..., None, :])  # [N, C, 3, 3]
-    trunk = result.points[rows[:, [landmarks.joints.index(name) for name in TRUNK]]]
-    hips, shoulders = (unit(trunk[:, k] - trunk[:, k + 1])[:, None] for k in (0, 2))
     inlier = result.inlier[rows].astype(np.float64)
-    error = np.swapaxes(side_view_errors(landmarks, hips, shoulders, ray), 1, 2)
-    weight = inlier * (np.maximum(views.weight[rows], _MIN_CONFIDENCE) / error) ** 2
+    weight = inlier * np.maximum(views.weight[rows], _MIN_CONFIDENCE) ** 2
     normal, weighted = (np.einsum("nkc,ncij->nkij", each, across) for each in (inlier, weight))
     sure = (np.linalg.det(normal) > _MIN_DETERMINANT)[..., None, None]
     variance = (MEAN_SHAPE[0] * landmarks.picture_sigma) ** 2 / TWO_RAYS_VARIANCE

@@ -91,17 +91,6 @@ _RANGES_DEG: dict[str, tuple[tuple[float, float], ...]] = {
 neutral pose. American Academy of Orthopaedic Surgeons (1965): thoracolumbar 80/25, 35 and 45 deg and cervical
 45/45, 45 and 60 deg, each divided among its bones; right limbs are mirrored."""
 
-_SIDE_VIEW: dict[str, tuple[float, float]] = {
-    "clavicle": (2.8, 2.8),
-    "upper_arm": (1.8, 3.0),
-    "hand": (1.0, 5.0),
-    "pelvis": (1.8, 2.5),
-    **dict.fromkeys(("thigh", "shank", "foot", "toes"), (1.0, 1.6)),
-}
-"""Ratio of errors in pictures from the side to the table's, on the near side and the far one, on the tuning
-flights. A detector puts both shoulders, and both hips, halfway between them there, and a hidden hand onto the
-other one."""
-
 
 @dataclass(frozen=True)
 class Landmarks:
@@ -136,9 +125,14 @@ def _tables() -> dict[str, Landmarks]:
     return found
 
 
+def is_blazepose(joints: Sequence[str]) -> bool:
+    """Test if keypoints are BlazePose's: no other detector finds corners of the mouth."""
+    return "left_mouth" in joints
+
+
 def landmarks_of(joints: Sequence[str]) -> tuple[Landmarks, Index] | None:
-    """Return a skeleton's landmarks (mouth corners tell BlazePose's) and columns; None for too few."""
-    table = _tables()["blazepose" if "left_mouth" in joints else "coco"]
+    """Return a skeleton's landmarks and columns; None for too few."""
+    table = _tables()["blazepose" if is_blazepose(joints) else "coco"]
     kept = np.array([k for k, name in enumerate(table.joints) if name in joints], dtype=np.intp)
     names = [table.joints[k] for k in kept.tolist()]
     if len(kept) < MIN_LANDMARKS or not set(TRUNK).issubset(names):
@@ -146,24 +140,6 @@ def landmarks_of(joints: Sequence[str]) -> tuple[Landmarks, Index] | None:
     columns = np.array([list(joints).index(name) for name in names], dtype=np.intp)
     spread = table.body_sigma[kept], table.modes[kept], table.picture_sigma[kept]
     return Landmarks(tuple(names), table.bone[kept], table.offset[kept], *spread), columns
-
-
-def side_view_errors(landmarks: Landmarks, hips: Float, shoulders: Float, ray: Float) -> Float:
-    """Return the ratios [..., K] of errors in pictures from any direction to the table's, see `_SIDE_VIEW`.
-
-    All [..., 3] have length 1: from the right hip to the left one, the same of shoulders, and the ray. NaN
-    counts as a picture from the front.
-    """
-    found = []
-    for joint, bone in zip(landmarks.joints, landmarks.bone.tolist(), strict=True):
-        side = joint.partition("_")[0]
-        part = BONES[bone].removeprefix(f"{side}_")
-        near, far = _SIDE_VIEW.get(part, (1.0, 1.0))
-        across = shoulders if part in ("clavicle", "upper_arm", "hand") else hips
-        away = np.nan_to_num(np.sum(across * ray, axis=-1)) * (1.0 if side == SIDES[0] else -1.0)
-        # Nearer to the front than 45 deg errors are those of the front.
-        found.append(1 + (np.where(away > 0, far, near) - 1) * away**4)
-    return np.stack(found, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -684,6 +660,11 @@ def _carried(slope: Float, covariance: Float) -> Float:
 
 
 # --- first poses ---------------------------------------------------------------------------------------
+
+
+def turns_of_bones(landmarks: Landmarks, place: Float) -> Float:
+    """Return world rotations [N, 22, 3, 3] of bones the way landmarks [N, K, 3] point; NaN if unknown."""
+    return _first_poses(body_model(), landmarks, place).turn
 
 
 def _first_poses(model: BodyModel, landmarks: Landmarks, place: Float) -> Poses:

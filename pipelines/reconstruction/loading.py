@@ -24,6 +24,7 @@ from pipelines.geometry.noise import (
     pose_errors,
     sum_sigma,
 )
+from pipelines.reconstruction.body_fit import is_blazepose
 from pipelines.reconstruction.log_stretches import Mended, mend, warnings_of_stretches
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.camera_poses import parsed_noise_models, stated_models, stated_noise
@@ -154,6 +155,7 @@ def _load_camera(
         trajectory=mended.trajectory,
         static=entry.poses.static,
         sigma=None,
+        blazepose=is_blazepose(source.joints),
         loosened=mended.loosened,
         stepped_m=mended.stepped_m,
         # From here on frames count the rows of the table: pictures without a time are not in it.

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Int64, Intrinsics, nearest_rows
+from pipelines.geometry.arrays import Bool, Float, Float32, Int64, Intrinsics, nearest_rows
 from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion, velocities
@@ -73,6 +73,10 @@ class Camera:
     loosened: Float | None = None  # [N, 2] m, rad: what poses in bad stretches of the log err by besides
     stepped_m: float = 0.0  # per axis: what positions of a log that jumps and stays err by besides
     modes: ErrorModes | None = None  # of what its background leaves open, if its poses were refined by it
+    blazepose: bool = False  # True if that network placed its keypoints
+    aside: Float32 | None = (
+        None  # [M, J, 2] errors of detections' rays by the side that they see (`view_errors`)
+    )
 
     @cached_property
     def focal_px(self) -> float:
@@ -92,7 +96,8 @@ class Camera:
         found = self.detections
         rays = np.full((len(self.frame_t_ns), self.most_people, len(found.joints), 2), np.nan)
         confidence = np.zeros(rays.shape[:-1])
-        rays[found.frame, self._rank] = undistort(found.xy, self.intrinsics)
+        seen = undistort(found.xy, self.intrinsics)
+        rays[found.frame, self._rank] = seen if self.aside is None else seen - self.aside
         confidence[found.frame, self._rank] = found.confidence
         confidence[np.isnan(rays[..., 0])] = 0.0
         return rays, confidence
@@ -222,9 +227,17 @@ def poses_of_cameras(cameras: list[Camera], t_ns: Int64, between: Interpolation)
 
 
 def observe(
-    cameras: list[Camera], found: Candidates, choice: Int64, t_ns: Int64, between: Interpolation
+    cameras: list[Camera],
+    found: Candidates,
+    choice: Int64,
+    t_ns: Int64,
+    between: Interpolation,
+    sides: Int64 | None = None,
 ) -> Observations:
-    """Interpolate chosen detections' keypoints [T', C, P] (-1: none) and poses to common times [T]."""
+    """Interpolate chosen detections' keypoints [T', C, P] (-1: none) and poses to common times [T].
+
+    Each joint has the view of its side, see `on_sides`; None: of its own.
+    """
     views, weights, sigmas = [], [], []
     for c, camera in enumerate(cameras):
         rays, confidence = sightings_of(camera, found, c, choice[:, c])
@@ -238,11 +251,14 @@ def observe(
         position, rotation = poses_of_cameras(cameras, t_ns, between)
     stated = [sigma for sigma in sigmas if sigma is not None]
     pose_sigma = _all_sigmas(cameras, sigmas) if stated else None
+    rays, confidence = np.stack(views, axis=3), np.nan_to_num(np.stack(weights, axis=3))
+    if sides is not None:
+        rays, confidence = on_sides(rays, confidence, sides)
     return Observations(
         t_ns=t_ns,
         joints=cameras[0].detections.joints,
-        rays=np.stack(views, axis=3),
-        confidence=np.nan_to_num(np.stack(weights, axis=3)),
+        rays=rays,
+        confidence=confidence,
         position=position,
         rotation=rotation,
         pose_sigma=pose_sigma,
@@ -330,17 +346,26 @@ def _chosen(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[F
     confidence, delay_s = np.full(shape, np.nan), np.full(shape, np.nan)
     own_rays, own_confidence = camera.seen()
     own_delay_s = camera.row_delay_s() if camera.intrinsics.readout_s else None
-    frame = found.frame[:, c]
-    apart_ns = np.abs(found.t_ns - camera.frame_t_ns[frame])
-    nearest_last = np.argsort(-apart_ns, kind="stable")
     for person in range(choice.shape[1]):
-        rows = nearest_last[(frame[nearest_last] >= 0) & (choice[nearest_last, person] >= 0)]
-        rays[frame[rows], person] = own_rays[frame[rows], choice[rows, person]]
-        confidence[frame[rows], person] = own_confidence[frame[rows], choice[rows, person]]
+        frames, rows, _ = frames_of(camera, found, c, choice[:, person])
+        detection = choice[rows, person]
+        rays[frames, person] = own_rays[frames, detection]
+        confidence[frames, person] = own_confidence[frames, detection]
         if own_delay_s is not None:
-            delay_s[frame[rows], person] = own_delay_s[frame[rows], choice[rows, person]]
+            delay_s[frames, person] = own_delay_s[frames, detection]
     confidence[np.isnan(rays[..., 0])] = np.nan
     return rays, confidence, delay_s
+
+
+def frames_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Int64, Int64, Int64]:
+    """List the frames in which a person [T'] was chosen, their times' rows in `found`, and the detections."""
+    frame, row_of = found.frame[:, c], np.full(len(camera.frame_t_ns), -1)
+    nearest_last = np.argsort(-np.abs(found.t_ns - camera.frame_t_ns[frame]), kind="stable")
+    rows = nearest_last[(frame[nearest_last] >= 0) & (choice[nearest_last] >= 0)]
+    row_of[frame[rows]] = rows
+    frames = np.flatnonzero(row_of >= 0)
+    rows = row_of[frames]
+    return frames, rows, np.searchsorted(camera.detections.frame, frames) + choice[rows]
 
 
 def _at(camera: Camera, values: Float, t_ns: Int64) -> Float:

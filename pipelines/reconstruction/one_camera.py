@@ -36,7 +36,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-from pipelines.geometry.rig import BONE, BONES, SIDES, unit
+from pipelines.geometry.rig import BONE, BONES, SIDES
 from pipelines.reconstruction.body_fit import (
     MIN_LANDMARKS,
     BodyFit,
@@ -51,7 +51,6 @@ from pipelines.reconstruction.body_fit import (
     joint_ranges,
     settle,
     shared_prior,
-    side_view_errors,
 )
 
 STATURE_M = (float(MEAN_SHAPE[0]), 0.08)
@@ -162,9 +161,6 @@ def fit_seen_body(
     across_m = _ALIKE * MEAN_SHAPE[0] * landmarks.picture_sigma
     rays = replace(rays, sigma=rays.sigma * across_m / distance)
     poses, level = _first_poses(points, rays, first_turns, (t_ns[row] - t_ns[row[0]]) / 1e9)
-    hips, shoulders = (poses.turn[:, BONE[name], :, 1] for name in ("pelvis", "chest"))
-    errors = side_view_errors(landmarks, hips, shoulders, unit(poses.root - rays.camera))
-    rays = replace(rays, sigma=rays.sigma * errors)
     shared = Shared(points.prior.mean[:12].copy(), np.zeros((len(landmarks.bone), 3)), level)
     found = _fit_windows(points, t_ns, row, rays, poses, shared)
     known = found.body.row

@@ -417,14 +417,12 @@ def _observe_with_offsets(
     """Observe with these clock offsets, at some times of the skeleton."""
     cameras = shifted(flight.cameras, offset_s)
     t_ns, sides = flight.observations.t_ns[times], flight.sides[times]
-    observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between)
-    rays, confidence = on_sides(observed.rays, observed.confidence, sides)
-    observed = replace(observed, rays=rays, confidence=confidence)
-    rows = confidence[..., 0].size
+    observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between, sides)
+    rows = sides[..., 0].size
     return observed, replace(
         flight.views,
-        rays=rays.reshape(rows, len(cameras), 2),
-        weight=confidence.reshape(rows, len(cameras)),
+        rays=observed.rays.reshape(rows, len(cameras), 2),
+        weight=observed.confidence.reshape(rows, len(cameras)),
         pose_index=flight.views.pose_index[:rows],
         position=observed.position,
         rotation=observed.rotation,

@@ -6,14 +6,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipelines.geometry.arrays import Float, Index
+from pipelines.geometry.arrays import Float, Index, Intrinsics
 from pipelines.geometry.body_model import MEAN_SHAPE, SHAPE_SIGMA, body_model
 from pipelines.geometry.poses import (
+    look_at,
     matrix_from_quaternion,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
 )
 from pipelines.geometry.rig import BONES
+from pipelines.geometry.triangulation import Triangulation
 from pipelines.reconstruction import one_camera
 from pipelines.reconstruction.body_fit import (
     BodyFit,
@@ -23,14 +25,13 @@ from pipelines.reconstruction.body_fit import (
     Poses,
     Rays,
     Shared,
-    _bounded,
-    _less,
     _seen,
     fit_body,
     joint_ranges,
     landmarks_of,
-    side_view_errors,
+    turns_of_bones,
 )
+from pipelines.reconstruction.observations import Camera, candidates, observe, on_sides
 from pipelines.reconstruction.one_camera import (
     STATURE_M,
     UNKNOWN_LEVEL_SIGMA_M,
@@ -38,7 +39,10 @@ from pipelines.reconstruction.one_camera import (
     StandingPoints,
     fit_seen_body,
 )
-from pipelines.session.people import SKELETONS
+from pipelines.reconstruction.view_errors import ViewErrors, without_view_errors
+from pipelines.session.description import Interpolation
+from pipelines.session.people import SKELETONS, mirrored
+from pipelines.session.records import Detections, Trajectory
 
 TIMES = 40
 
@@ -96,59 +100,53 @@ def test_derivatives_are_those_of_the_cost(cameras: int) -> None:
         assert normal.shared_right[g] == pytest.approx(np.diff(costs)[0] / (4 * step), rel=1e-3, abs=1e-3)
 
 
-def test_modes_of_landmarks_count_as_their_covariance_does() -> None:
-    rng = np.random.default_rng(1)
-    # Errors of 1e-3 standard deviations have weights of 1 to 1e-6.
-    white, modes = 1e-3 * rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5, 3, 4))
-    error, flat, unit = white.reshape(2, 15, 1), modes.reshape(2, 15, 4), np.eye(15)[None].repeat(2, axis=0)
-    precision = np.linalg.inv(unit + flat @ flat.mT)
-    _, cost, shift = _bounded(white, modes)
-    np.testing.assert_allclose(cost, (error.mT @ precision @ error).ravel(), rtol=1e-5)
-    np.testing.assert_allclose(_less(shift, _less(shift, unit)), precision, atol=1e-5)
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_keypoints_of_a_body_lose_the_errors_of_their_side(exchanged: bool) -> None:
+    joints, landmarks, t_ns = SKELETONS["blazepose33"].joints, known_landmarks(), np.arange(6) * 100_000_000
+    columns = [joints.index(name) for name in landmarks.joints]
+    poses, none = Poses(np.zeros((6, 3)), walking(t_ns / 1e9)), np.zeros((len(columns), 3))
+    place = places(Points(body_model(), landmarks), poses, Shared(MEAN_SHAPE, none))
+    at, every = np.array([4.8, 5.6, 3.2]), np.arange(6)
+    between = Interpolation(max_gap_s=1.0, max_extrapolation_s=1.0)
+    quaternion = look_at(at, np.zeros(3))
+    ray = (place - at) / np.linalg.norm(place - at, axis=-1, keepdims=True)
+    shift = MEAN_SHAPE[0] * ViewErrors.of(landmarks.joints).at(turns_of_bones(landmarks, place), ray)
+    assert 0.01 < np.linalg.norm(shift, axis=-1).max() < 0.1  # of joints that are known within a hand's width
 
+    def rays_to(points: Float) -> Float:
+        seen = (points - at) @ matrix_from_quaternion(quaternion)
+        return np.asarray(seen[..., :2] / seen[..., 2:])
 
-def test_modes_that_move_in_a_walk_are_found_within_their_standard_deviations() -> None:
-    rng, landmarks, t_s = np.random.default_rng(3), known_landmarks(), np.arange(60) / 3
-    points, many = Points(body_model(), landmarks), landmarks.modes.shape[-1]
-    poses, shared = (
-        Poses(np.outer(t_s, [0.4, 0.3, 0.0]), walking(t_s)),
-        Shared(MEAN_SHAPE, 0 * landmarks.offset),
+    xy, points = np.full((6, 33, 2), np.nan), np.full((6, 33, 3), np.nan)
+    xy[:, columns], points[:, columns] = 500 * rays_to(place + shift), place
+    order = [joints.index(mirrored(joint)) for joint in joints] if exchanged else list(range(33))
+    log = Trajectory(t_ns, np.tile(at, (6, 1)), np.tile(quaternion, (6, 1)))
+    people = Detections(joints, every, every * 0, xy[:, order], np.ones((6, 33)), every)
+    lens = Intrinsics(640, 480, 500.0, 500.0, 0.0, 0.0, "none", ())
+    camera = Camera("drone1", lens, every, t_ns, every >= 0, log, False, None, people, blazepose=True)
+    found, choice = candidates([camera], between), np.zeros((6, 1, 1), dtype=np.int64)
+    seen = observe([camera], found, choice, t_ns, between)
+    sides = np.broadcast_to(np.array(order)[:, None], seen.confidence.shape)
+    one, ok = np.ones((6 * 33, 1)), np.zeros(6 * 33, dtype=np.int8)
+    result = Triangulation(
+        points.reshape(-1, 3), one > 0, ok, one[:, :, None], one[:, 0].astype(np.int64), one
     )
-    amplitude = 1.4 * np.sin(t_s[:, None] * rng.uniform(1.0, 4.0, many) + rng.uniform(0.0, 6.3, many))
-    moved = np.einsum("tkij,kjm,tm->tki", poses.turn[:, landmarks.bone], landmarks.modes, amplitude)
-    sigma_m = MEAN_SHAPE[0] * landmarks.picture_sigma[:, None] / 2
-    place = places(points, poses, shared) + MEAN_SHAPE[0] * moved
-    place += sigma_m * rng.normal(size=place.shape)
-    own = np.tile(sigma_m[..., None] ** 2 * np.eye(3), (len(t_s), 1, 1, 1))
-    body = fit_body(landmarks, np.round(t_s * 1e9).astype(np.int64), place, partial(errors_of, own))
-    assert body is not None
-
-    # One system of amplitudes and the fitted poses, which have the fit's prior.
-    fitted, seen = Poses(body.centre[:, 0], matrix_from_quaternion(body.rotation)), _seen(place, own)
-    shared = Shared(body.shape, shared.offset)
-    *_, slope, shift = points._whitened(fitted, seen, shared)
-    prior = points.normal(fitted, seen, shared, whole=False).pose - slope.mT @ slope
-    slope = np.linalg.inv(np.eye(slope.shape[1]) - shift @ shift.mT) @ slope
-    modes = body.shape[0] * seen.root_weight @ fitted.turn[:, landmarks.bone] @ landmarks.modes
-    both = np.concatenate([slope, modes.reshape(len(t_s), -1, many)], axis=2)
-    precision = both.mT @ both + np.eye(69 + many) * (np.arange(69 + many) >= 69)
-    precision[:, :69, :69] += prior
-    white = (seen.root_weight @ (place - places(points, fitted, shared))[..., None]).reshape(len(t_s), -1, 1)
-    error = np.linalg.solve(precision[:, 69:, 69:], both[..., 69:].mT @ white)[..., 0] - amplitude
-    error -= error.mean(axis=0)  # offsets of the body are constant, too
-    white = np.linalg.solve(np.linalg.inv(precision)[:, 69:, 69:], error[..., None])[..., 0]
-    # The mean of 360 squares of standard normal numbers errs by 0.075.
-    assert np.mean(error * white) == pytest.approx(1.0, abs=0.3)
+    corrected = without_view_errors([camera], found, choice, seen, sides, result, None)
+    seen = observe(corrected, candidates(corrected, between), choice, t_ns, between)
+    rays, _ = on_sides(seen.rays, seen.confidence, sides)
+    # A ray's shift is taken as linear in the joint's: what is left is the square of their angle.
+    assert np.abs(rays[:, 0, columns, 0] - rays_to(place)).max() < 2 * (0.1 / 8) ** 2
 
 
-def test_far_limbs_err_more_in_pictures_from_the_side() -> None:
-    landmarks, left = known_landmarks(), np.array([0.0, 1.0, 0.0])
-    rays = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [np.nan, 0.0, 0.0]])
-    front, from_right, from_left, unknown = side_view_errors(landmarks, left, left, rays)
-    assert (front == 1).all()
-    assert (unknown == 1).all()
-    one, other = (landmarks.joints.index(f"{side}_wrist") for side in ("left", "right"))
-    assert from_right[one] == from_left[other] > from_right[other] == from_left[one] == 1
+def test_errors_of_both_sides_are_mirrored() -> None:
+    joints, rng = SKELETONS["blazepose33"].joints, np.random.default_rng(0)
+    errors = ViewErrors.of(joints)
+    turn = np.broadcast_to(np.eye(3), (20, 22, 3, 3))
+    direction = rng.normal(size=(20, 33, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    other, mirror = [joints.index(mirrored(joint)) for joint in joints], np.array([1.0, -1.0, 1.0])
+    mirrored_shift = errors.at(turn, (direction * mirror)[:, other])[:, other] * mirror
+    np.testing.assert_allclose(errors.at(turn, direction), mirrored_shift, atol=2e-5)
 
 
 @pytest.fixture(scope="module")
