@@ -229,14 +229,14 @@ DETECTOR = BlazePoseDetector(
     "BlazePose GHUM full (MediaPipe 0.10.21, Apache-2.0): 33 joints, on the CPU",
     PERSON_MODELS,
     BLAZEPOSE_MODELS,
-    Measured(sample_mpjpe_mm=34.4, person_ms=17.0),
+    Measured(sample_mpjpe_mm=25.5, person_ms=18.0),
 )
 HEAVY = BlazePoseDetector(
     "blazepose-heavy",
     "BlazePose GHUM heavy (@mediapipe/pose 0.5.1675469404, Apache-2.0): 33 joints, on the CPU",
     PERSON_MODELS,
     HEAVY_MODELS,
-    Measured(sample_mpjpe_mm=29.9, person_ms=54.0),
+    Measured(sample_mpjpe_mm=20.8, person_ms=60.0),
 )
 
 
