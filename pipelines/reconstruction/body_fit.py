@@ -663,7 +663,10 @@ def _carried(slope: Float, covariance: Float) -> Float:
 
 
 def turns_of_bones(landmarks: Landmarks, place: Float) -> Float:
-    """Return world rotations [N, 22, 3, 3] of bones the way landmarks [N, K, 3] point; NaN if unknown."""
+    """Return world rotations [N, 22, 3, 3] of bones the way landmarks [N, K, 3] point.
+
+    A bone without landmarks turns as its parent does; all are NaN where the trunk is unknown.
+    """
     return _first_poses(body_model(), landmarks, place).turn
 
 

@@ -74,9 +74,7 @@ class Camera:
     stepped_m: float = 0.0  # per axis: what positions of a log that jumps and stays err by besides
     modes: ErrorModes | None = None  # of what its background leaves open, if its poses were refined by it
     blazepose: bool = False  # True if that network placed its keypoints
-    aside: Float32 | None = (
-        None  # [M, J, 2] errors of detections' rays by the side that they see (`view_errors`)
-    )
+    aside: Float32 | None = None  # [M, J, 2] errors of detections' rays by the side seen (`view_errors`)
 
     @cached_property
     def focal_px(self) -> float:

@@ -86,7 +86,9 @@ def without_view_errors(
 ) -> list[Camera]:
     """Return cameras whose detections of people [T', C, P] by BlazePose are rid of these errors.
 
-    `sides` are those of `observations` (`on_sides`), and `result` what was triangulated from these.
+    `sides` are those of `observations` (`on_sides`), and `result` what was triangulated from these. Missing
+    joints are where the line between their neighbours in time has them. A joint that is never known, or not
+    before the camera, keeps its rays. Without `stature_m` the person has the mean stature.
     """
     known = landmarks_of(observations.joints)
     if known is None or not any(camera.blazepose for camera in cameras):
